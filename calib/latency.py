@@ -29,8 +29,8 @@ from edge.core.stats import percentiles
 from edge.inference.graph import GraphError
 from edge.inference.latency_profile import LatencyError, LatencyProfile, load_profile
 from edge.power.meters.meter import MEASURED
+from edge.reasoning.generation_cycle import Mode
 from edge.reasoning.prompt import InstructionError, check_instruction
-from edge.run.reasoning_loop import Mode
 from export.evaluation.calibration import CalibrationError, load_calibration
 
 LEAST: Final = 20

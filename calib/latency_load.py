@@ -13,16 +13,18 @@ from typing import Any, Final
 from edge.artifacts.files import ArtifactError
 from edge.artifacts.manifest import Artifacts
 from edge.core.geometry import SE2
+from edge.inference.generation_task import GenerationModels
 from edge.inference.graph import GraphError
 from edge.inference.language import ContextOverflowError, LanguageModel
 from edge.inference.latency_profile import times_of
 from edge.inference.policy import Policy
 from edge.inference.scheduling import GiveWay, Schedule, TickActivity, enter, schedule_for
 from edge.inference.warm_up import warm_up
-from edge.run.reasoning_loop import Mode, ReasoningLoop
+from edge.reasoning.generation_cycle import Mode, ReasoningConfig
+from edge.run.reasoning_loop import ReasoningLoop, ReasoningOutputs, ReasoningSchedule
 from edge.state.frame import fit_frame
 from edge.state.ring import EncodedFrame, TokenRing
-from edge.state.semantic import SemanticSlot
+from edge.state.semantic import SemanticSlot, SharedState
 from export.evaluation.calibration import Clip
 
 WARM: Final = 3
@@ -135,20 +137,13 @@ def measure(
     ring = TokenRing(capacity, policy.tokens_shape)
     ticks = Ticks(artifacts, policy, ring, slot, clip, schedule)
     reasoning = ReasoningLoop(
-        language=language,
-        policy=policy,
-        ring=ring,
-        slot=slot,
-        instruction=instruction,
-        frame_offsets_s=runtime.frame_offsets_s,
-        max_new_tokens=runtime.max_new_tokens,
-        release_delay_s=lambda: 0.0,
-        recorder=found,  # type: ignore[arg-type]  # it only puts
+        GenerationModels(language, policy),
+        SharedState(ring, slot),
+        ReasoningConfig(runtime.frame_offsets_s, runtime.max_new_tokens, mode),
+        instruction,
         stop=stop,
-        mode=mode,
-        give_way=GiveWay(activity) if schedule.shared else None,
-        role=schedule.reasoning,
-        say=say,
+        schedule=ReasoningSchedule(give_way=GiveWay(activity) if schedule.shared else None, role=schedule.reasoning),
+        outputs=ReasoningOutputs(found, say),  # type: ignore[arg-type]  # it only puts
     )
     threads = [
         threading.Thread(target=lambda: ticks.run(stop), name="control", daemon=True),
@@ -166,10 +161,10 @@ def measure(
         for thread in threads:
             thread.join(JOIN_S)
         sys.setswitchinterval(interval_s)
-    why = ticks.error or reasoning.failure
+    why = ticks.error or reasoning.cycle.failure
     if why:
         raise MeasureError(f"it ended by itself: {why}")
-    return Measured(tuple(found.times_s[WARM:]), ticks.ticks, ticks.late, reasoning.failed)
+    return Measured(tuple(found.times_s[WARM:]), ticks.ticks, ticks.late, reasoning.cycle.failed)
 
 
 def _wait(found: Generations, wanted: int, seconds: float, stop: threading.Event, say: Callable[[str], None]) -> None:

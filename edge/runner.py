@@ -33,11 +33,11 @@ from edge.flightlog.reader import parts
 from edge.inference import engines
 from edge.inference.release import ReleaseDelayError, parse_release_delay
 from edge.odometry.calibration import CalibrationError
+from edge.reasoning.generation_cycle import Mode
 from edge.reasoning.prompt import InstructionError
 from edge.run.arming import RefusedError, StoppedEarlyError
 from edge.run.assembly import RunOptions
 from edge.run.instructions import check_first_instruction
-from edge.run.reasoning_loop import Mode
 from edge.run.session import RunSession
 from edge.state.switches import Decoding, RecoverySwitch, SwitchOptions
 from firmware_bridge.client import BridgeUnavailable

@@ -1,17 +1,21 @@
 """Late anchor: when the newest frame of a generation is to be captured, so that the older ones can be prefilled first.
 
-A generation's frames are 3 s apart. With all of them taken at its start, the newest one grows old while the older ones
-are prefilled. Planned for the end of that, it stands only behind itself and the prompt's tail.
+A generation's frames are 3 s apart. If all are taken at its start, the newest one ages while the older ones are
+prefilled. The newest frame is therefore planned for the end of that prefill.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from edge.state.ring import EncodedFrame, TokenRing
+
 EARLY_NS = 100_000_000
-"""How long before the planned instant a frame may have been captured: one period of a 10 Hz camera."""
+"""Earliest capture of the newest frame before the planned instant, ns: one period of a 10 Hz camera."""
 LATE_NS = 500_000_000
-"""How long after it: as far as older frames may be from where they are wanted (`edge.state.ring`)."""
+"""Latest capture of the newest frame after the planned instant, ns: the tolerance of older frames
+(`edge.state.ring`)."""
 
 
 @dataclass(frozen=True)
@@ -21,9 +25,9 @@ class Anchor:
     begun_ns: int
     """Stamp of the frame that was newest when the generation began."""
     planned_ns: int
-    """From here the older frames are counted back."""
+    """Instant from which the ages of the older frames count, ns."""
     late_ns: int = LATE_NS
-    """How long after it the frame may have been captured."""
+    """Latest capture of the newest frame after that instant, ns."""
 
     @classmethod
     def after(cls, newest_ns: int, prefix_ns: int) -> Anchor:
@@ -39,11 +43,11 @@ class Anchor:
         return cls(newest_ns, newest_ns, 0)
 
     def older_ns(self, offset_s: float) -> int:
-        """Stamp that an older frame is wanted for."""
+        """Wanted stamp of an older frame of that age, ns."""
         return self.planned_ns - round(offset_s * 1e9)
 
     def is_older(self, stamp_ns: int) -> bool:
-        """Whether a frame comes before every one that can be the newest."""
+        """Whether a frame precedes every candidate for the newest frame."""
         return stamp_ns < max(self.begun_ns, self.planned_ns - EARLY_NS)
 
     def choose(self, newest_ns: int) -> int | None:
@@ -54,3 +58,19 @@ class Anchor:
         if newest_ns < self.planned_ns - EARLY_NS:
             return None
         return min(newest_ns, self.planned_ns + self.late_ns)
+
+
+def older_frames(ring: TokenRing, plan: Anchor, offsets_s: Sequence[float]) -> Iterator[EncodedFrame]:
+    """Frames before the newest at the given ages, oldest first; `offsets_s`: ages, s, in descending order.
+
+    Each frame is looked up only when it is asked for: with a slow model it may not have been captured earlier.
+    """
+    last_ns: int | None = None
+    for offset_s in offsets_s:
+        frame = ring.nearest(plan.older_ns(offset_s))
+        if frame is None or not plan.is_older(frame.stamp_ns):
+            continue
+        if last_ns is not None and frame.stamp_ns <= last_ns:
+            continue
+        last_ns = frame.stamp_ns
+        yield frame

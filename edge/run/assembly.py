@@ -11,6 +11,7 @@ from pathlib import Path
 
 from edge.artifacts.manifest import Artifacts
 from edge.flightlog.recorder import Recorder
+from edge.inference.generation_task import GenerationModels
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
 from edge.inference.release import ReleaseDelay
@@ -19,16 +20,17 @@ from edge.motion.controller import Controller, ControllerConfig
 from edge.power.governor.plan import read_power_plan
 from edge.power.monitor import Activity, PowerMonitor
 from edge.power.run_power import make_power_monitor
+from edge.reasoning.generation_cycle import Mode, ReasoningConfig
 from edge.run.command_tap import CommandTap
-from edge.run.control_loop import ControlLoop
-from edge.run.reasoning_loop import Mode, ReasoningLoop
+from edge.run.control_loop import CommandChain, ControlConfig, ControlLoop, ControlOutputs, ControlSources
+from edge.run.reasoning_loop import ReasoningLoop, ReasoningOutputs, ReasoningSchedule
 from edge.run.robot_inputs import RobotInputs
 from edge.safety.monitors.semantic import SemanticConfig
 from edge.safety.monitors.watch import Sources, Watch, WatchConfig
 from edge.safety.pre_arm import PreArm
 from edge.safety.supervisor import Supervisor
 from edge.state.ring import TokenRing
-from edge.state.semantic import SemanticSlot
+from edge.state.semantic import SemanticSlot, SharedState
 from edge.state.switches import Switches, SwitchOptions
 from firmware_bridge.core.config import ConfigError, RobotConfig
 
@@ -99,19 +101,19 @@ def assemble(
     period_ns = runtime.tick_period_ms * 1_000_000
     seconds = max(runtime.frame_offsets_s) + HISTORY_MARGIN_S
     switches = options.switches_for(artifacts)
-    slot = SemanticSlot()
-    ring = TokenRing(math.ceil(seconds * 1e9 / period_ns), engines.policy.tokens_shape)
+    shared = SharedState(TokenRing(math.ceil(seconds * 1e9 / period_ns), engines.policy.tokens_shape), SemanticSlot())
     # The monitor asks the loops what they do, the loops ask the monitor what they may: each by the time it runs.
     loops: list[tuple[ControlLoop, ReasoningLoop]] = []
 
     def activity() -> Activity:
         control, reasoning = loops[0]
+        cycle = reasoning.cycle
         return Activity(
             ticks=control.statistics.ticks,
             reasoning=reasoning.busy,
-            generations=reasoning.generations,
+            generations=cycle.published,
             reasoning_s=reasoning.busy_ns / 1e9,
-            abandoned=reasoning.cancelled + reasoning.failed + reasoning.missed_frames,
+            abandoned=cycle.cancelled + cycle.failed + cycle.missed_frames,
         )
 
     power = make_power_monitor(
@@ -123,22 +125,18 @@ def assemble(
         say=say,
     )
     reasoning = ReasoningLoop(
-        language=engines.language,
-        policy=engines.policy,
-        ring=ring,
-        slot=slot,
-        instruction=options.instruction,
-        frame_offsets_s=runtime.frame_offsets_s,
-        max_new_tokens=runtime.max_new_tokens,
-        release_delay_s=options.release_delay.sampler(),
-        recorder=recorder,
+        GenerationModels(engines.language, engines.policy),
+        shared,
+        ReasoningConfig(runtime.frame_offsets_s, runtime.max_new_tokens, options.mode, switches.decoding),
+        options.instruction,
         stop=stop,
-        mode=options.mode,
-        decoding=switches.decoding,
-        budget=power.budget,
-        give_way=GiveWay(engines.activity) if engines.schedule.shared else None,
-        role=engines.schedule.reasoning,
-        say=say,
+        schedule=ReasoningSchedule(
+            release_delay_s=options.release_delay.sampler(),
+            budget=power.budget,
+            give_way=GiveWay(engines.activity) if engines.schedule.shared else None,
+            role=engines.schedule.reasoning,
+        ),
+        outputs=ReasoningOutputs(recorder, say),
     )
     config = ControllerConfig(
         limits=robot.limits,
@@ -146,38 +144,26 @@ def assemble(
         frame_max_age_ms=FRAME_MAX_AGE_MS,
         odometry_max_age_ms=float(robot.odometry.max_age_ms),
     )
+    semantic = semantic_config(artifacts, options.mode)
     watch = WatchConfig.standard(
-        config,
-        period_ns,
-        image_px=runtime.image_px,
-        camera_hz=robot.camera.rate_hz,
-        semantic=semantic_config(artifacts, options.mode),
+        config, period_ns, image_px=runtime.image_px, camera_hz=robot.camera.rate_hz, semantic=semantic
     )
     sources = Sources(
         findings=inputs.findings,
         attitude=inputs.reader.state,
         states=lambda: inputs.states,
         malformed=lambda: inputs.reader.malformed,
-        failed_generations=lambda: reasoning.failed,
-        invalid_texts=lambda: reasoning.invalid_in_a_row,
+        failed_generations=lambda: reasoning.cycle.failed,
+        invalid_texts=lambda: reasoning.cycle.invalid_in_a_row,
     )
     control = ControlLoop(
-        policy=engines.policy,
-        controller=Controller(config),
-        newest_frame=lambda: inputs.camera.newest,
-        history=inputs.history,
-        ring=ring,
-        slot=slot,
-        sink=sink,
-        recorder=recorder,
-        period_ns=period_ns,
-        step_s=runtime.step_s,
+        engines.policy,
+        ControlConfig(period_ns, runtime.step_s, semantic.trained_delay_s, switches),
+        ControlSources(lambda: inputs.camera.newest, inputs.history, inputs.offset_covariance),
+        shared,
+        CommandChain(Controller(config), Watch(watch, sources), Supervisor()),
+        ControlOutputs(sink, recorder, on_tick),
         stop=stop,
-        watch=Watch(watch, sources),
-        supervisor=Supervisor(),
-        on_tick=on_tick,
-        offset_covariance=inputs.offset_covariance,
-        switches=switches,
     )
     loops.append((control, reasoning))
     pre_arm = PreArm(

@@ -1,7 +1,8 @@
-"""The fast thread: 10 Hz on absolute deadlines, from the newest frame to a velocity command; it waits for nobody."""
+"""The control thread: from the newest frame to a velocity command on absolute deadlines; reasoning never delays it."""
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -20,21 +21,22 @@ from edge.motion.controller import TARGET_TIME_S, Controller, ControllerInputs, 
 from edge.motion.recovery import MOVING, Recovery
 from edge.safety.faults.findings import Finding
 from edge.safety.faults.table import FAULT_OF_CAUSE
+from edge.safety.monitors.semantic import SemanticConfig
 from edge.safety.monitors.watch import Watch, WatchConfig
 from edge.safety.supervisor import FaultEvent, State, Supervisor, SupervisorInputs, SupervisorOutputs
 from edge.state.frame import Frame
 from edge.state.pose_history import PoseHistory, StampedPose
-from edge.state.ring import EncodedFrame, TokenRing
-from edge.state.semantic import SemanticSlot, SemanticState, waypoints_now
+from edge.state.ring import EncodedFrame
+from edge.state.semantic import LatencyInput, SemanticState, SharedState, waypoints_now
 from edge.state.switches import Switches
 from firmware_bridge.client import BridgeStatus
 
 BRIDGE_SILENCE_NS = 500_000_000
-"""The bridge reports at 10 Hz; when it has hung there is no point in commanding on."""
+"""Silence of the bridge after which it counts as hung and the run ends, ns; it reports at 10 Hz."""
 GLANCE_S = 0.01
-"""How often a waiting control thread looks for what must not wait for the next tick."""
+"""Period at which the waiting control thread polls for urgent faults, s."""
 THINKING = "thinking"
-"""Why the robot stands in a mode that drives for a while after each answer only."""
+"""Reason for standing in sync mode while a generation is under way."""
 
 OffsetCovariance = Callable[[int], npt.NDArray[np.float64] | None]
 """3×3 covariance (m², rad²) of the motion since an anchor's stamp in ns; None while it is not known."""
@@ -52,12 +54,12 @@ class CommandSink(Protocol):
 
 @dataclass
 class ControlStatistics:
-    """Figures of all ticks; its size does not depend on how many there were."""
+    """Statistics of all ticks; constant size."""
 
     ticks: int = 0
     missed: int = 0
     tick_ms: Samples = field(default_factory=Samples)
-    """From the tick's deadline to its command sent: lateness of the wake-up included."""
+    """From the tick's deadline until its command was sent, lateness of the wake-up included, ms."""
     delay_s: Samples = field(default_factory=Samples)
     delay_error_ms: Samples = field(default_factory=Samples)
     """|Δt measured for the action expert − (instant of its call − anchor)|."""
@@ -71,70 +73,103 @@ class ControlStatistics:
     """How often each fault of the table was raised."""
 
 
+@dataclass(frozen=True)
+class ControlConfig:
+    """Rates and limits of the control loop itself."""
+
+    period_ns: int
+    """Time between two ticks, ns."""
+    step_s: float
+    """Time between two points of the policy's trajectory, s."""
+    trained_delay_s: float = SemanticConfig.trained_delay_s
+    """Largest Δt that the policy was trained for, s; it is given no larger one."""
+    switches: Switches = field(default_factory=Switches)
+    """Which recoveries are in force."""
+
+    def __post_init__(self) -> None:
+        if self.period_ns <= 0 or not (0 < self.step_s < math.inf and 0 < self.trained_delay_s < math.inf):
+            raise ValueError(
+                f"control loop: expected a period, step and trained delay above 0, found {self.period_ns} ns, "
+                f"{self.step_s} s and {self.trained_delay_s} s"
+            )
+
+
+@dataclass(frozen=True)
+class ControlSources:
+    """What the control loop reads of the robot; no call may wait."""
+
+    newest_frame: Callable[[], Frame | None]
+    history: PoseHistory
+    offset_covariance: OffsetCovariance = lambda _anchor_ns: None
+
+
+@dataclass(frozen=True)
+class CommandChain:
+    """What turns a trajectory into a command, and what may hold the robot."""
+
+    controller: Controller
+    watch: Watch
+    supervisor: Supervisor
+
+    @classmethod
+    def standard(cls, controller: Controller, period_ns: int) -> CommandChain:
+        """Monitors that know only what the control loop itself sees."""
+        return cls(controller, Watch(WatchConfig.standard(controller.config, period_ns)), Supervisor())
+
+
+@dataclass(frozen=True)
+class ControlOutputs:
+    """Where commands, log records and ticks are reported."""
+
+    sink: CommandSink
+    recorder: Recorder | None = None
+    on_tick: Callable[[bool], None] = lambda _on_time: None
+    """Takes after every tick whether it was on time; it must neither wait nor raise."""
+
+
 class ControlLoop:
     """Frame → shared encoder → ring buffer → semantic state → action expert → supervisor → controller → bridge."""
 
     def __init__(
         self,
-        *,
         policy: Policy,
-        controller: Controller,
-        newest_frame: Callable[[], Frame | None],
-        history: PoseHistory,
-        ring: TokenRing,
-        slot: SemanticSlot,
-        sink: CommandSink,
-        recorder: Recorder | None,
-        period_ns: int,
-        step_s: float,
+        config: ControlConfig,
+        sources: ControlSources,
+        shared: SharedState,
+        chain: CommandChain,
+        outputs: ControlOutputs,
+        *,
         stop: threading.Event,
-        watch: Watch | None = None,
-        supervisor: Supervisor | None = None,
-        on_tick: Callable[[bool], None] | None = None,
-        offset_covariance: OffsetCovariance | None = None,
-        switches: Switches | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`on_tick` is told after every tick whether it was on time; it must neither wait nor raise.
-
-        Without `watch` and `supervisor` the standard ones are used, which know only what the loop itself sees.
-        """
         self._policy = policy
-        self._controller = controller
-        self._recovery = Recovery(switches or Switches(), controller.config.limits)
-        self._newest_frame = newest_frame
-        self._history = history
-        self._ring = ring
-        self._slot = slot
-        self._sink = sink
-        self._recorder = recorder
-        self._period_ns = period_ns
-        self._step_s = step_s
-        self._watch = watch or Watch(WatchConfig.standard(controller.config, period_ns))
-        self._supervisor = supervisor or Supervisor()
-        self._on_tick = on_tick
-        self._offset_covariance = offset_covariance
+        self._config = config
+        self._sources = sources
+        self._ring, self._slot = shared.ring, shared.slot
+        self._controller, self._watch, self._supervisor = chain.controller, chain.watch, chain.supervisor
+        self._recovery = Recovery(config.switches, chain.controller.config.limits)
+        self._sink, self._recorder, self._on_tick = outputs.sink, outputs.recorder, outputs.on_tick
         self.last_seq = 0
-        """Sequence number of the last command; arming has used some before the first tick."""
+        """Sequence number of the last command; arming uses some before the first tick."""
         self._stop = stop
         self._clock = clock
         self._tokens: EncodedFrame | None = None
         self._last_tick_ns: int | None = None
         self._moving = False
         self.supervision = SupervisorOutputs(State.STARTING, 0.0, False, (), (), "")
-        """What the supervisor said last; any thread may read it."""
+        """The supervisor's last outputs; any thread may read them."""
         self.ended_by = ""
-        """Who ended `run` before its time: "bridge" or "supervisor"; empty while nobody has."""
+        """What ended `run` early: "bridge" or "supervisor"; empty otherwise."""
         self.statistics = ControlStatistics()
 
     def run(self, epoch_ns: int, end_ns: int | None) -> str | None:
-        """Tick at `epoch_ns` plus whole periods until `stop` or `end_ns`; deadlines that were slept over are skipped.
+        """Tick at `epoch_ns` plus whole periods until `stop` or `end_ns`; deadlines that have passed are skipped.
 
         Returns why the bridge or the supervisor stopped the robot (`ended_by` says which), else None; raises
         BridgeUnavailable when the bridge has gone.
         """
         self._watch.begin()
-        deadline_ns = epoch_ns
+        deadline_ns, period_ns = epoch_ns, self._config.period_ns
         while end_ns is None or deadline_ns < end_ns:
             if self._wait_until(deadline_ns):
                 return None
@@ -148,16 +183,15 @@ class ControlLoop:
             silent_ns = 0 if status is None else now_ns - status.stamp_ns
             if status is not None and (status.state == "stopped" or silent_ns > BRIDGE_SILENCE_NS):
                 return self._ended_by_bridge(status, now_ns)
-            behind = (now_ns - deadline_ns) // self._period_ns
-            # Deadlines that a late tick has slept over are skipped, not made up for: each counts as a missed tick.
+            behind = (now_ns - deadline_ns) // period_ns
+            # Deadlines that passed during a late tick are skipped; each counts as a missed tick.
             self.statistics.missed += max(0, behind)
-            if self._on_tick is not None:
-                self._on_tick(behind <= 0)
-            deadline_ns += self._period_ns * max(1, behind + 1)
+            self._on_tick(behind <= 0)
+            deadline_ns += period_ns * max(1, behind + 1)
         return None
 
     def _ended_by_bridge(self, status: BridgeStatus, now_ns: int) -> str:
-        """Why, in words; what it is in the fault table goes into the log and to the operator."""
+        """Report the fault to the supervisor; returns why the bridge ended the run, for the operator."""
         self.ended_by = "bridge"
         fault, why = "bridge-hung", f"no word from it for {(now_ns - status.stamp_ns) / 1e9:.1f} s"
         if status.state == "stopped":
@@ -167,21 +201,21 @@ class ControlLoop:
         return why
 
     def tick(self, deadline_ns: int) -> VelocityCommand:
-        """One pass; returns the command it sent."""
+        """Run one tick; returns the command that it sent."""
         start_ns = self._clock()
-        encoded = self._encode(self._newest_frame())
+        encoded = self._encode(self._sources.newest_frame())
         encoded_ns = self._clock()
         semantic = self._slot.state
-        pose = self._history.newest()
+        pose = self._sources.history.newest()
         trajectory: npt.NDArray[np.float32] | None = None
         delay_s: float | None = None
-        offset = None
+        latency: LatencyInput | None = None
         now_ns = self._clock()
         if semantic is not None and pose is not None and encoded is not None:
             delay_s = semantic.delay_s(now_ns)
-            offset = semantic.motion_offset(pose.T_odom_base)
+            latency = semantic.latency_input(now_ns, pose.T_odom_base, self._config.trained_delay_s)
             called_ns = self._clock()
-            trajectory = self._act(encoded, pose, delay_s, offset, semantic)
+            trajectory = self._act(encoded, pose, latency, semantic)
             self.statistics.plans += 1
             self.statistics.plans_not_finite += not is_plan(trajectory)
             error_ms = abs(float(np.float32(delay_s)) * 1e3 - (called_ns - semantic.anchor_ns) / 1e6)
@@ -193,7 +227,7 @@ class ControlLoop:
         self._supervise(found, acted_ns)
         inputs = ControllerInputs(
             trajectory=trajectory,
-            # Of the frame that was encoded and driven by, which is not the camera's newest when the encoder fails.
+            # Age of the encoded frame, which is not the camera's newest when the encoder fails.
             frame_age_ms=None if driven_ns is None else (acted_ns - driven_ns) / 1e6,
             odometry_age_ms=None if pose is None else (acted_ns - pose.stamp_ns) / 1e6,
             speed_scale=self.supervision.speed_scale,
@@ -202,13 +236,13 @@ class ControlLoop:
         T_odom_base = None if pose is None else pose.T_odom_base
         command = self._recovery.step(
             self._controller.step(inputs, acted_ns),
-            _leading_waypoints(semantic, offset),
+            None if latency is None else _leading_waypoints(semantic, latency.offset),
             T_odom_base,
             acted_ns,
             inputs.speed_scale,
         )
         if command.reason in MOVING:
-            self._controller.halt(command.reason)  # what comes after it speeds up from standing
+            self._controller.halt(command.reason)  # the next command accelerates from standstill
         self._send(command)
         end_ns = self._clock()
         self._last_tick_ns = end_ns - deadline_ns
@@ -231,8 +265,8 @@ class ControlLoop:
                 "generation": None if used is None else used.generation,
                 "anchor_ns": None if used is None else used.anchor_ns,
                 "delay_s": delay_s,
-                "delay_given_s": None if delay_s is None else self._watch.given_delay_s(delay_s),
-                "offset": None if offset is None else offset.as_tuple(),
+                "delay_given_s": None if latency is None else latency.delay_s,
+                "offset": None if latency is None else latency.offset.as_tuple(),
                 "offset_sd": None if used is None else self._offset_sd(used.anchor_ns),
                 "pose": None if pose is None else pose.T_odom_base.as_tuple(),
                 "state": None if pose is None else (pose.vx_mps, pose.vy_mps, pose.wz_radps),
@@ -248,7 +282,7 @@ class ControlLoop:
         return command
 
     def glance(self) -> bool:
-        """Between ticks: what must not wait for the next one; True when the robot was stopped by it."""
+        """Between ticks: act on urgent faults; returns whether they stopped the robot."""
         findings = self._watch.urgent()
         if not findings:
             return False
@@ -293,7 +327,7 @@ class ControlLoop:
             self._recorder.put("/fault", event.stamp_ns, record)
 
     def _hold(self, semantic: SemanticState | None, pose: StampedPose | None, now_ns: int) -> str | None:
-        """Why the robot must stand whatever the plan says."""
+        """Why the robot must stand, whatever the trajectory; None: it may drive."""
         if self.supervision.speed_scale <= 0:
             return self.supervision.active[0] if self.supervision.active else "not-supervised"
         until_ns = self._slot.drive_until_ns
@@ -310,9 +344,9 @@ class ControlLoop:
             self.statistics.unsent += 1
 
     def _encode(self, frame: Frame | None) -> EncodedFrame | None:
-        """Encode a good frame once: a frame seen before, or not fit to be used, gives the tokens there are."""
-        # Of the capture, not of now: a robot that starts to turn has moved before the picture shows it.
-        T_odom_base = None if frame is None else self._history.at(frame.stamp_ns)
+        """Encode a new, usable frame; for any other frame return the tokens of the last one."""
+        # The pose at capture: a robot that starts to turn has moved before the picture shows it.
+        T_odom_base = None if frame is None else self._sources.history.at(frame.stamp_ns)
         fit = self._watch.picture(frame, T_odom_base, self._clock())
         if frame is None or not fit or (self._tokens is not None and frame.stamp_ns == self._tokens.stamp_ns):
             return self._tokens
@@ -329,31 +363,31 @@ class ControlLoop:
         return self._tokens
 
     def _act(
-        self, encoded: EncodedFrame, pose: StampedPose, delay_s: float, offset: SE2, semantic: SemanticState
+        self, encoded: EncodedFrame, pose: StampedPose, latency: LatencyInput, semantic: SemanticState
     ) -> npt.NDArray[np.float32]:
         state = (pose.vx_mps, pose.vy_mps, pose.wz_radps)
         try:
-            return self._policy.act(encoded.tokens, state, self._watch.given_delay_s(delay_s), offset, semantic)
+            return self._policy.act(encoded.tokens, state, latency.delay_s, latency.offset, semantic)
         except GraphError:
-            # No plan at all: the controller takes what is not finite as bad output and stops.
+            # The controller treats a trajectory that is not finite as bad output and stops.
             return np.full((1, 3), np.nan, dtype=np.float32)
 
     def _offset_sd(self, anchor_ns: int) -> list[float] | None:
         """Standard deviations (m, m, rad) of the motion since the anchor, for the log."""
-        covariance = None if self._offset_covariance is None else self._offset_covariance(anchor_ns)
+        covariance = self._sources.offset_covariance(anchor_ns)
         return None if covariance is None else [float(v) for v in np.sqrt(np.maximum(np.diag(covariance), 0.0))]
 
     def _seconds(self, trajectory: npt.NDArray[np.float32] | None) -> list[list[float]] | None:
-        """The plan at whole seconds, which is what the flight log keeps of it."""
+        """The trajectory at whole seconds, as the flight log keeps it."""
         if trajectory is None:
             return None
-        every = max(1, round(TARGET_TIME_S / self._step_s))
+        every = max(1, round(TARGET_TIME_S / self._config.step_s))
         return [[float(v) for v in row] for row in trajectory[every - 1 :: every]]
 
 
-def _leading_waypoints(semantic: SemanticState | None, offset: SE2 | None) -> npt.NDArray[np.float32] | None:
+def _leading_waypoints(semantic: SemanticState | None, offset: SE2) -> npt.NDArray[np.float32] | None:
     """The last text's waypoints [points, 2], m in the robot's frame now; None for a text that plans to wait."""
-    if semantic is None or semantic.waypoints is None or offset is None or semantic.waits:
+    if semantic is None or semantic.waypoints is None or semantic.waits:
         return None
     points: npt.NDArray[np.float32] = waypoints_now(semantic.waypoints, offset)[0]
     return points

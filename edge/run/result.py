@@ -48,7 +48,7 @@ def run_result(
     duration_s: float,
 ) -> dict[str, Any]:
     """What happened; `faults` are lines for the operator, each of which ended the run or made it worthless."""
-    ticks = control.statistics
+    ticks, cycle, times = control.statistics, reasoning.cycle, reasoning.times
     if (fault := plan_fault(ticks)) is not None:
         faults = [*faults, fault]
     return {
@@ -65,14 +65,14 @@ def run_result(
             "state": control.supervision.state.value,
         },
         "reasoning": {
-            "generations": reasoning.generations,
-            "failed": reasoning.failed,
-            "cancelled": reasoning.cancelled,
-            "missed_frames": reasoning.missed_frames,
-            "invalid_texts": reasoning.invalid_texts,
-            "generation_ms": percentiles(reasoning.generation_ms, "p50", "p99", "max"),
-            "anchor_to_ready_ms": percentiles(reasoning.anchor_to_ready_ms, "p50", "p99", "max"),
-            "late_anchor_ms": percentiles(reasoning.late_anchor_ms, "p50", "p99", "max"),
+            "generations": cycle.published,
+            "failed": cycle.failed,
+            "cancelled": cycle.cancelled,
+            "missed_frames": cycle.missed_frames,
+            "invalid_texts": cycle.invalid_texts,
+            "generation_ms": percentiles(times.generation_ms, "p50", "p99", "max"),
+            "anchor_to_ready_ms": percentiles(times.anchor_to_ready_ms, "p50", "p99", "max"),
+            "late_anchor_ms": percentiles(times.late_anchor_ms, "p50", "p99", "max"),
             "gave_way_ms": reasoning.gave_way_ns / 1e6,
         },
         "delay_s": percentiles(ticks.delay_s, "p50", "p99", "max"),

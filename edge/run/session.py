@@ -20,12 +20,12 @@ from edge.inference.language import ContextOverflowError, LanguageModel
 from edge.inference.policy import Policy
 from edge.inference.scheduling import TickActivity, enter, freeze_garbage, lock_memory, schedule_for
 from edge.inference.warm_up import check_tick, warm_up
+from edge.reasoning.generation_cycle import Mode
 from edge.reasoning.prompt import InstructionError
 from edge.run.arming import POLL_S, RefusedError, StoppedEarlyError, arm, disarm
 from edge.run.assembly import Engines, Loops, RunOptions, assemble
 from edge.run.command_tap import CommandTap
 from edge.run.instructions import InstructionSocket
-from edge.run.reasoning_loop import Mode
 from edge.run.result import run_record, run_result
 from edge.run.robot_inputs import RobotInputs
 from edge.run.service import ServiceReporter
@@ -236,7 +236,7 @@ class RunSession:
             return "starting"
         supervision = self._loops.control.supervision
         faults = f" ({', '.join(supervision.active)})" if supervision.active else ""
-        return f"{supervision.state.value}{faults}, {self._loops.reasoning.generations} generations"
+        return f"{supervision.state.value}{faults}, {self._loops.reasoning.cycle.published} generations"
 
     def _await_inputs(self, inputs: RobotInputs, bridge: BridgeClient) -> None:
         """Until there is a picture and a pose: a robot that an operator arms may be switched on hours later."""
@@ -362,7 +362,9 @@ class RunSession:
                 self._print(says or "all faults have cleared")
             self._print_lines()
             self._take_instructions(told, loops)
-            hang = watch.step(reasoning.last_progress_ns, reasoning.generation_ms.quantile(1.0), time.monotonic_ns())
+            hang = watch.step(
+                reasoning.last_progress_ns, reasoning.times.generation_ms.quantile(1.0), time.monotonic_ns()
+            )
             if hang is Hang.INTERRUPT:
                 self._print(f"reasoning has been in one call for {watch.stood_s:.0f} s; it is interrupted")
                 reasoning.cancel()

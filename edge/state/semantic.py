@@ -12,12 +12,22 @@ import numpy.typing as npt
 
 from edge.core.geometry import SE2
 from edge.state.reasoning_text import WAYPOINT_TIMES_S, Waypoints, plans_to_wait
+from edge.state.ring import TokenRing
 
 STRAIGHT_AHEAD: Waypoints = tuple((time_s / 2, 0.0) for time_s in WAYPOINT_TIMES_S)
 """Waypoints at 0.5 m/s: what graphs are warmed up and timed with."""
 
 Context = Mapping[str, npt.NDArray[np.generic]]
 """The semantic context by tensor name: `context.0.key` [1, heads, d, T], `context.0.value` [1, heads, T, d], …"""
+
+
+@dataclass(frozen=True)
+class LatencyInput:
+    """The action expert's input `latency`: [Δt s, Δx m, Δy m, Δθ rad] (Algorithm 4, line 19)."""
+
+    delay_s: float
+    offset: SE2
+    """(Δx, Δy, Δθ): the current pose in the robot frame at the anchor."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +64,11 @@ class SemanticState:
         """(Δx, Δy, Δθ): the current pose in the robot frame at the anchor."""
         return self.T_odom_anchor.inverse() @ T_odom_base
 
+    def latency_input(self, now_ns: int, T_odom_base: SE2, trained_delay_s: float) -> LatencyInput:
+        """Δt limited to 0 to `trained_delay_s`, the largest that the policy was trained for, and the motion offset."""
+        delay_s = min(max(self.delay_s(now_ns), 0.0), trained_delay_s)
+        return LatencyInput(delay_s, self.motion_offset(T_odom_base))
+
 
 def waypoints_now(waypoints: Waypoints, offset: SE2) -> npt.NDArray[np.float32]:
     """Transform waypoints (x m, y m) of the anchor's robot frame to [1, points, 2] in the current one (appendix C).
@@ -73,3 +88,11 @@ class SemanticSlot:
         self.state: SemanticState | None = None
         self.drive_until_ns: int | None = None
         """Until when there may be driving; None: no such limit."""
+
+
+@dataclass(frozen=True)
+class SharedState:
+    """What the two loops exchange: encoded frames to the reasoning, the semantic state to the control loop."""
+
+    ring: TokenRing
+    slot: SemanticSlot

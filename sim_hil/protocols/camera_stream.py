@@ -11,16 +11,11 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
-import os
-import select
 import signal
 import socket
-import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final, TextIO
@@ -29,7 +24,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_hil.protocols.snapshot import SnapshotReader, SnapshotWriter, TornSnapshotError
+from sim_hil.processes.child_process import Message, input_is_open, take_standard_output, write_message
+from sim_hil.protocols.render_process import RenderProcess
+from sim_hil.protocols.snapshot import SnapshotReader, TornSnapshotError
 from sim_hil.scene.scene import load_scene
 from sim_hil.simulation.camera import CameraWorld
 from sim_hil.simulation.sensor_noise import SensorNoise
@@ -40,12 +37,6 @@ _BOUNDARY: Final = "frame"
 _IDLE_S: Final = 0.05
 _FRAME_TIMEOUT_S: Final = 5.0
 _SEND_TIMEOUT_S: Final = 5.0
-_START_TIMEOUT_S: Final = 60.0
-_END_S: Final = 3.0
-
-
-class CameraStreamError(RuntimeError):
-    """The camera process did not start, or it died."""
 
 
 @dataclass(frozen=True)
@@ -165,11 +156,8 @@ class _Handler(BaseHTTPRequestHandler):
         """Do not log requests."""
 
 
-class CameraStream:
-    """Handle of the camera process: starts it, passes the pose to it, counts its images.
-
-    The process ends with this object or with this process.
-    """
+class CameraStream(RenderProcess):
+    """Starts the camera process, hands it the pose, counts its pictures. It ends when this object or process does."""
 
     def __init__(
         self,
@@ -188,19 +176,10 @@ class CameraStream:
         # The parent opens the socket, so that a port in use is reported at once and a free port is known.
         with listen(port) as listening:
             self.port = int(listening.getsockname()[1])
-            self._pose = SnapshotWriter(state_length)
             command = [sys.executable, "-m", "sim_hil.protocols.camera_stream", "--scene", scene, "--robot", robot]
             command += ["--people", str(people), "--seed", str(seed), "--width", str(size[0]), "--height", str(size[1])]
-            command += ["--listen-fd", str(listening.fileno()), "--pose-fd", str(self._pose.fd)]
-            self._process = subprocess.Popen(
-                command,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                pass_fds=(self._pose.fd, listening.fileno()),
-            )
-        assert self._process.stdout is not None
-        os.set_blocking(self._process.stdout.fileno(), False)
-        self._partial = b""
+            command += ["--listen-fd", str(listening.fileno())]
+            super().__init__(command, state_length, (listening.fileno(),))
         self.pictures = 0
 
     @property
@@ -208,67 +187,11 @@ class CameraStream:
         """URL of the stream."""
         return f"http://127.0.0.1:{self.port}/stream.mjpg"
 
-    def show(self, render_state: NDArray[np.float64]) -> None:
-        """Set the state that the next image shows; takes microseconds."""
-        self._pose.write(render_state)
-
-    def wait_ready(self, stop: Sequence[int]) -> bool:
-        """Wait until the stream is ready; return False if `stop` gets an element first. Raises CameraStreamError."""
-        deadline_ns = time.monotonic_ns() + int(_START_TIMEOUT_S * 1e9)
-        while not self.poll():
-            if stop:
-                return False
-            if time.monotonic_ns() > deadline_ns:
-                raise CameraStreamError(f"the camera process was not ready within {_START_TIMEOUT_S:g} s")
-            time.sleep(0.02)
-        return True
-
-    def poll(self) -> bool:
-        """Read the process's events; return whether "ready" was among them. Raises CameraStreamError."""
-        assert self._process.stdout is not None
-        ready = False
-        with contextlib.suppress(BlockingIOError):
-            while True:
-                chunk = os.read(self._process.stdout.fileno(), 65536)
-                if not chunk:
-                    raise CameraStreamError("the camera process died; see its output above")
-                *lines, self._partial = (self._partial + chunk).split(b"\n")
-                for line in lines:
-                    event = json.loads(line)
-                    self.pictures += event["event"] == "picture"
-                    ready = ready or event["event"] == "ready"
-        return ready
-
-    def close(self) -> None:
-        """End the process, by a kill if necessary; may be called twice."""
-        assert self._process.stdin is not None and self._process.stdout is not None
-        if self._process.stdout.closed:
-            return
-        with contextlib.suppress(BrokenPipeError):
-            self._process.stdin.close()
-        try:
-            self._process.wait(_END_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        self._process.stdout.close()
-        self._pose.close()
-
-
-def _event_pipe() -> TextIO:
-    """Return the pipe to the parent; from now on, prints of libraries to stdout go to stderr."""
-    pipe = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    return pipe
-
-
-def _parent_lives() -> bool:
-    return not select.select([sys.stdin], [], [], 0)[0]
-
-
-def _send_event(pipe: TextIO, **event: object) -> None:
-    pipe.write(json.dumps(event) + "\n")
-    pipe.flush()
+    def events(self) -> list[Message]:
+        """Events since the last call; counts the pictures among them. Raises CameraProcessError."""
+        events = super().events()
+        self.pictures += sum(event["event"] == "picture" for event in events)
+        return events
 
 
 def _jpeg(rgb: NDArray[np.uint8]) -> bytes:
@@ -282,7 +205,7 @@ def _render_while_parent_lives(
     world: CameraWorld, poses: SnapshotReader, shutter: Shutter, size: tuple[int, int], noise: SensorNoise, pipe: TextIO
 ) -> None:
     period_ns, next_ns = round(1e9 / RATE_HZ), time.monotonic_ns()
-    while _parent_lives():
+    while input_is_open():
         left_s = (next_ns - time.monotonic_ns()) / 1e9
         if not shutter.wanted or left_s > 0:
             time.sleep(min(_IDLE_S, max(left_s, 0.002)))
@@ -297,7 +220,7 @@ def _render_while_parent_lives(
             continue
         if state is not None:
             shutter.show(captured_ns, _jpeg(noise.add(world.render(state, *size))))
-            _send_event(pipe, event="picture")
+            write_message(pipe, {"event": "picture"})
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -311,7 +234,7 @@ def main(argv: list[str] | None = None) -> int:
     # Ctrl-C reaches the whole process group, but the parent decides when the camera ends.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
-    pipe, shutter, size = _event_pipe(), Shutter(), (args.width, args.height)
+    pipe, shutter, size = take_standard_output(), Shutter(), (args.width, args.height)
     server = CameraServer(socket.socket(fileno=args.listen_fd), shutter)
     world = CameraWorld(load_scene(args.scene), people=args.people, seed=args.seed, robot=args.robot)
     poses = SnapshotReader(args.pose_fd, world.state_size)
@@ -319,7 +242,7 @@ def main(argv: list[str] | None = None) -> int:
     threading.Thread(target=server.serve_forever, name="camera-http", daemon=True).start()
     # BrokenPipeError: the parent died between two checks of stdin.
     with contextlib.closing(world), contextlib.closing(poses), contextlib.suppress(BrokenPipeError):
-        _send_event(pipe, event="ready")
+        write_message(pipe, {"event": "ready"})
         _render_while_parent_lives(world, poses, shutter, size, noise, pipe)
     return 0
 

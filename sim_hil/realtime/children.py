@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -16,9 +14,9 @@ from functools import partial
 from pathlib import Path
 from types import TracebackType
 
+from sim_hil.processes.child_process import last_lines, signal_on_parent_death
+
 _POLL_S = 0.05
-_PR_SET_PDEATHSIG = 1
-_LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
 
 Tick = Callable[[], None]
 """Called a few times a second while waiting (progress)."""
@@ -43,7 +41,7 @@ class Child:
 
     def failure(self, what: str) -> StepError:
         """An error naming the step, its log and the log's last lines."""
-        lines = "\n".join(f"    {line}" for line in tail(self.log)) or "    (the log is empty)"
+        lines = "\n".join(f"    {line}" for line in last_lines(self.log)) or "    (the log is empty)"
         return StepError(f"step '{self.step}' failed: {what}; its log {self.log} ends with\n{lines}")
 
 
@@ -165,19 +163,7 @@ def _kill_session(pid: int) -> None:
 
 def _prepare(fifo_priority: int) -> None:
     # Even a SIGKILL of the parent must not leave a robot walking: the kernel then interrupts the children.
-    if _LIBC is not None:
-        _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
+    signal_on_parent_death(signal.SIGINT)
     if fifo_priority > 0:
         with suppress(PermissionError):
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(fifo_priority))
-
-
-def tail(path: Path, lines: int = 8, limit_bytes: int = 16_384) -> list[str]:
-    """The last non-empty lines of a text file, as far as they can be read."""
-    try:
-        with path.open("rb") as stream:
-            stream.seek(max(0, path.stat().st_size - limit_bytes))
-            text = stream.read().decode("utf-8", "replace")
-    except OSError:
-        return []
-    return [line.rstrip() for line in text.splitlines() if line.strip()][-lines:]

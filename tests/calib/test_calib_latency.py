@@ -16,7 +16,7 @@ from edge.artifacts.manifest import load_artifacts
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE
 from edge.flightlog.recorder import Recorder
 from edge.inference.latency_profile import LatencyError, LatencyProfile, load_profile, times_of
-from edge.run.reasoning_loop import Mode
+from edge.reasoning.generation_cycle import Mode
 from export.evaluation.calibration import load_calibration
 from sim_hil.benchmark.conditions.latency import parse_latency
 

@@ -16,8 +16,8 @@ import psutil
 import pytest
 
 from reporting.progress_line import Progress, TraceTail
-from sim_hil.realtime import children
-from sim_hil.realtime.children import Children, StepError, tail
+from sim_hil.processes.child_process import last_lines
+from sim_hil.realtime.children import Children, StepError
 from sim_hil.realtime.stack import COMMANDS, free_domain, socket_dir
 from tools import demo
 from tools.report.machine import machine_facts
@@ -229,8 +229,8 @@ def test_a_child_deaf_to_sigint_is_killed_with_all_it_started(tmp_path: Path) ->
     )
     with Children(tmp_path, grace_s=0.2) as running:
         child = running.start("deaf", [sys.executable, "-c", script])
-        running.wait_until(child, lambda: bool(tail(child.log)), 10, "grandchild", lambda: None)
-        grandchild = int(tail(child.log)[0])
+        running.wait_until(child, lambda: bool(last_lines(child.log)), 10, "grandchild", lambda: None)
+        grandchild = int(last_lines(child.log)[0])
         with pytest.raises(StepError, match=r"step 'deaf' failed: did not end within 0\.2 s of SIGINT and was killed"):
             running.stop(child)
     assert not child.running
@@ -256,8 +256,8 @@ def test_processes_end_in_reverse_order_of_their_start(tmp_path: Path) -> None:
     with Children(tmp_path) as running:
         for name in ("robot", "bridge", "runner"):
             child = running.start(name, [sys.executable, "-c", script])
-            running.wait_until(child, lambda log=child.log: bool(tail(log)), 10, "line", lambda: None)
-    ends = [int(tail(tmp_path / f"{name}.log")[-1]) for name in ("runner", "bridge", "robot")]
+            running.wait_until(child, lambda log=child.log: bool(last_lines(log)), 10, "line", lambda: None)
+    ends = [int(last_lines(tmp_path / f"{name}.log")[-1]) for name in ("runner", "bridge", "robot")]
     assert ends == sorted(ends)
 
 
@@ -344,5 +344,5 @@ def test_the_trace_is_followed_while_it_is_written(tmp_path: Path) -> None:
 def test_the_last_lines_of_a_log_are_found_in_a_long_file(tmp_path: Path) -> None:
     path = tmp_path / "long.log"
     path.write_text("".join(f"line {n}\n\n" for n in range(100_000)))
-    assert children.tail(path, lines=2) == ["line 99998", "line 99999"]
-    assert children.tail(tmp_path / "absent") == []
+    assert last_lines(path, lines=2) == ["line 99998", "line 99999"]
+    assert last_lines(tmp_path / "absent") == []

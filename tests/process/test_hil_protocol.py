@@ -24,8 +24,9 @@ from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.rpc import RpcClient, RpcError, move_parameter
 from sim_hil.hil.command import main
 from sim_hil.hil.trace import TraceWriter
+from sim_hil.protocols.render_process import CameraProcessError
 from sim_hil.protocols.snapshot import TornSnapshotError
-from sim_hil.protocols.unitree.camera_process import CameraProcess, CameraProcessError
+from sim_hil.protocols.unitree.camera_process import CameraProcess
 from sim_hil.protocols.unitree.services.service import Received
 from sim_hil.protocols.unitree.video_service import ERROR_NO_IMAGE, VideoHub
 from tests.support.processes import (
@@ -341,7 +342,8 @@ import sys
 import pybullet
 from sim_hil.hil import command as hil
 from sim_hil.simulation.physics import Simulation
-from sim_hil.protocols.unitree.camera_process import CameraProcess, CameraProcessError
+from sim_hil.protocols.render_process import CameraProcessError
+from sim_hil.protocols.unitree.camera_process import CameraProcess
 from sim_hil.protocols.unitree.services.service import ServiceServer
 calls = []
 before = {where}

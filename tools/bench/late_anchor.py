@@ -25,12 +25,14 @@ from edge.artifacts.manifest import Artifacts, load_artifacts
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, check_result_target, command_line, write_result
 from edge.core.geometry import SE2
 from edge.core.stats import percentiles
+from edge.inference.generation_task import GenerationModels
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
 from edge.inference.scheduling import GiveWay, Schedule, TickActivity, enter, freeze_garbage, run_as, schedule_for
-from edge.run.reasoning_loop import ReasoningLoop
+from edge.reasoning.generation_cycle import ReasoningConfig
+from edge.run.reasoning_loop import ReasoningLoop, ReasoningSchedule
 from edge.state.ring import EncodedFrame, TokenRing
-from edge.state.semantic import SemanticSlot
+from edge.state.semantic import SemanticSlot, SharedState
 from export.plan.measure import INSTRUCTION
 
 CAMERA_LEAD = 0.5
@@ -114,18 +116,12 @@ def run(artifacts: Artifacts, rounds: int, alone_s: float) -> dict[str, Any]:
 
     def loop(late: bool, gives_way: bool) -> ReasoningLoop:
         return ReasoningLoop(
-            language=language,
-            policy=ticks.policy,
-            ring=ticks.ring,
-            slot=ticks.slot,
-            instruction=INSTRUCTION,
-            frame_offsets_s=artifacts.runtime.frame_offsets_s,
-            max_new_tokens=artifacts.runtime.max_new_tokens,
-            release_delay_s=lambda: 0.0,
-            recorder=None,
+            GenerationModels(language, ticks.policy),
+            SharedState(ticks.ring, ticks.slot),
+            ReasoningConfig(artifacts.runtime.frame_offsets_s, artifacts.runtime.max_new_tokens),
+            INSTRUCTION,
             stop=stop,
-            late_anchor=late,
-            give_way=GiveWay(ticks.activity) if gives_way else None,
+            schedule=ReasoningSchedule(give_way=GiveWay(ticks.activity) if gives_way else None, late_anchor=late),
         )
 
     loops = {
@@ -172,7 +168,7 @@ def take_turns(
             for name, one in order[number % len(order) :] + order[: number % len(order)]:
                 generate(one, ticks, name)
                 for key, values in samples[name].items():
-                    values.append(getattr(one, key).newest)
+                    values.append(getattr(one.times, key).newest)
         rest(ticks, alone_s)
     return samples
 
@@ -187,7 +183,7 @@ def generate(loop: ReasoningLoop, ticks: Ticks, variant: str) -> None:
     """One generation of a variant; raises ArtifactError when it fails."""
     ticks.variant = variant
     while not loop.step():
-        if loop.failed:
+        if loop.cycle.failed:
             raise ArtifactError("a generation failed: check the artifacts with edge-export verify")
         if not ticks.running:
             ticks.encode(time.monotonic_ns())  # warm-up: nobody else does

@@ -1,4 +1,4 @@
-"""What the sniffer has heard so far, and what it means: pure judgements over stamped Moves."""
+"""Requests that the sniffer has received, and pure functions that judge the commands among them."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ class ReceivedCommand:
 
 
 class Tail:
-    """Reads a growing file of JSON lines, each once; an unfinished last line waits for its end."""
+    """Reads each line of a growing file of JSON lines once; an unfinished last line is read later."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._offset = 0
 
     def lines(self) -> list[dict[str, Any]]:
-        """What has been added since the last call; nothing while there is no file."""
+        """Lines added since the last call; none while there is no file."""
         try:
             with self._path.open("rb") as file:
                 file.seek(self._offset)
@@ -52,45 +52,47 @@ class Tail:
 
 
 class Hearing:
-    """The sniffer's last two minutes."""
+    """The requests that the sniffer has received in the last two minutes."""
 
     def __init__(self, path: Path) -> None:
         self._tail = Tail(path)
-        self._heard: deque[ReceivedCommand] = deque()
+        self._requests: deque[ReceivedCommand] = deque()
 
     def update(self) -> None:
-        """Read what has been added."""
+        """Read the lines that were added."""
         for line in self._tail.lines():
             found = line["velocity"]
             velocity = (float(found[0]), float(found[1]), float(found[2])) if isinstance(found, list) else None
-            self._heard.append(ReceivedCommand(int(line["t_ns"]), int(line["source"]), int(line["api_id"]), velocity))
-        while self._heard and self._heard[-1].t_ns - self._heard[0].t_ns > KEEP_NS:
-            self._heard.popleft()
+            self._requests.append(
+                ReceivedCommand(int(line["t_ns"]), int(line["source"]), int(line["api_id"]), velocity)
+            )
+        while self._requests and self._requests[-1].t_ns - self._requests[0].t_ns > KEEP_NS:
+            self._requests.popleft()
 
     def since(self, t_ns: int, *, but: frozenset[int] = frozenset()) -> list[ReceivedCommand]:
         """Requests from `t_ns` on, without those of the sources in `but`."""
         self.update()
-        return [heard for heard in self._heard if heard.t_ns >= t_ns and heard.source not in but]
+        return [request for request in self._requests if request.t_ns >= t_ns and request.source not in but]
 
     def sources(self) -> frozenset[int]:
-        """Return the sources of the requests of the last two minutes."""
+        """Sources of the requests of the last two minutes."""
         self.update()
-        return frozenset(heard.source for heard in self._heard)
+        return frozenset(request.source for request in self._requests)
 
     def last_moves(self, count: int) -> list[ReceivedCommand]:
         """The newest Moves, oldest first."""
         self.update()
-        moves = [heard for heard in self._heard if heard.velocity is not None]
+        moves = [request for request in self._requests if request.velocity is not None]
         return moves[-count:]
 
 
-def moves(heard: Iterable[ReceivedCommand]) -> list[tuple[int, Velocity]]:
+def moves(requests: Iterable[ReceivedCommand]) -> list[tuple[int, Velocity]]:
     """(ns, velocity) of every Move."""
-    return [(one.t_ns, one.velocity) for one in heard if one.api_id == ids.MOVE and one.velocity is not None]
+    return [(one.t_ns, one.velocity) for one in requests if one.api_id == ids.MOVE and one.velocity is not None]
 
 
 def first_lasting(stamped: Sequence[tuple[int, Velocity]], limit: Velocity) -> int | None:
-    """When the first command came of those at the end that are all within `limit`; None when the last is not.
+    """Stamp of the first of the commands at the end that are all within `limit`, ns; None when the last is not.
 
     `limit` bounds the size of each component; all zero: only zero is within it.
     """

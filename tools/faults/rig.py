@@ -13,8 +13,9 @@ from functools import partial
 from pathlib import Path
 
 from firmware_bridge.core.config import RobotConfig, load_robot_config
+from sim_hil.processes.child_process import last_lines
 from sim_hil.protocols.fault_client import FaultClient, FaultError
-from sim_hil.realtime.children import Child, Children, StepError, tail
+from sim_hil.realtime.children import Child, Children, StepError
 from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_FILE
 from tools.demo import INSTRUCTION
 from tools.faults.circle import SPEED_MPS
@@ -261,5 +262,5 @@ def _asks_or_ended(runner: Child) -> bool:
 
 def last_words(child: Child) -> str:
     """The last thing that a process has said in words, its result left out."""
-    said = [line for line in tail(child.log, 4) if "{" not in line]
+    said = [line for line in last_lines(child.log, 4) if "{" not in line]
     return said[-1] if said else f"nothing, exit code {child.process.returncode}"

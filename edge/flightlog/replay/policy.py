@@ -45,7 +45,7 @@ class _SkippedError(Exception):
 
 @dataclass
 class _ReplayedGeneration:
-    """A generation of the log with its pictures, run when a tick first needs it."""
+    """A logged generation and its pictures; its state is computed when a tick first needs it."""
 
     record: RecordedGeneration
     pictures: dict[int, bytes]
@@ -141,7 +141,7 @@ class Replayer:
         return None
 
     def _generate(self, replayed: _ReplayedGeneration) -> SemanticState:
-        """The semantic state of a generation, run once; its text is compared then."""
+        """Return the semantic state of a generation; run it and compare its text the first time."""
         if replayed.state is not None:
             return replayed.state
         record, found = replayed.record, self.comparison

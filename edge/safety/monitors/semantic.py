@@ -25,10 +25,6 @@ class SemanticConfig:
         if not (0 < self.trained_delay_s <= 600 and 0 < self.fade_s <= 600):
             raise ValueError(f"semantic ages must be 0 to 600 s, found {self.trained_delay_s} and {self.fade_s}")
 
-    def given_delay_s(self, delay_s: float) -> float:
-        """Δt as the action expert is told it: never beyond what it was trained for, never negative."""
-        return min(max(delay_s, 0.0), self.trained_delay_s)
-
 
 class SemanticMonitor:
     """Remembers the last generation and how many texts in a row were invalid."""

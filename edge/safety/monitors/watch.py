@@ -89,7 +89,6 @@ class Watch:
         self._robot = RobotMonitor(config.robot)
         self._machine = MachineMonitor(config.period_ns)
         self._pictures = FrameOutputs(False, 0, ())
-        self.given_delay_s = config.semantic.given_delay_s
 
     def begin(self) -> None:
         """Driving begins now: what other threads found while the robot was stood up is over."""

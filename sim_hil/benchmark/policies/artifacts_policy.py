@@ -16,25 +16,26 @@ import numpy.typing as npt
 from edge.artifacts.files import ArtifactError
 from edge.artifacts.manifest import Artifacts, load_artifacts
 from edge.core.geometry import SE2
+from edge.inference.generation_task import GenerationModels
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy as Model
 from edge.motion.controller import Controller, ControllerConfig, VelocityCommand
+from edge.reasoning.generation_cycle import Mode, ReasoningConfig
 from edge.run.assembly import FRAME_MAX_AGE_MS, semantic_config
-from edge.run.control_loop import ControlLoop
-from edge.run.reasoning_loop import Mode
+from edge.run.control_loop import CommandChain, ControlConfig, ControlLoop, ControlOutputs, ControlSources
 from edge.safety.monitors.watch import Sources, Watch, WatchConfig
 from edge.safety.supervisor import Supervisor
 from edge.state.frame import Frame, fit_frame
 from edge.state.pose_history import PoseHistory, StampedPose
 from edge.state.ring import TokenRing
-from edge.state.semantic import SemanticSlot, SemanticState
+from edge.state.semantic import SemanticSlot, SemanticState, SharedState
 from edge.state.switches import Switches, SwitchOptions
 from firmware_bridge.client import BridgeStatus
 from firmware_bridge.core.config import RobotConfig
 from sim_hil.benchmark.conditions.conditions import ConditionsError
 from sim_hil.benchmark.conditions.latency import LatencyProfile, LatencySampler
 from sim_hil.benchmark.env.observation import Observation
-from sim_hil.benchmark.policies.lockstep_reasoner import LockstepReasoner
+from sim_hil.benchmark.policies.lockstep_reasoner import VirtualTimeReasoner
 from sim_hil.benchmark.suite.episode import Episode
 
 CONTROL_PERIOD_NS = 100_000_000
@@ -123,47 +124,33 @@ class _Drive:
         self._frame: Frame | None = None
         self._history = PoseHistory(512)
         self._slot = SemanticSlot()
-        self._ring = TokenRing(round(RING_S * 1e9) // CONTROL_PERIOD_NS, model.tokens_shape)
-        seen = _DelayTold(model, blocking=mode is Mode.SYNC)
-        self._told = seen
-        self._reasoner = LockstepReasoner(
-            language=language,
-            policy=model,
-            ring=self._ring,
-            slot=self._slot,
-            instruction=instruction,
-            frame_offsets_s=runtime.frame_offsets_s,
-            max_new_tokens=runtime.max_new_tokens,
-            draw=draw,
-            mode=mode,
-            decoding=switches.decoding,
+        shared = SharedState(TokenRing(round(RING_S * 1e9) // CONTROL_PERIOD_NS, model.tokens_shape), self._slot)
+        self._recording = _RecordingPolicy(model, blocking=mode is Mode.SYNC)
+        self._reasoner = VirtualTimeReasoner(
+            GenerationModels(language, model),
+            shared,
+            ReasoningConfig(runtime.frame_offsets_s, runtime.max_new_tokens, mode, switches.decoding),
+            instruction,
+            draw,
         )
         config = ControllerConfig(
             robot.limits, runtime.step_s, FRAME_MAX_AGE_MS, odometry_max_age_ms=float(robot.odometry.max_age_ms)
         )
-        watch = WatchConfig.standard(
-            config, CONTROL_PERIOD_NS, image_px=runtime.image_px, semantic=semantic_config(artifacts, mode)
-        )
+        semantic = semantic_config(artifacts, mode)
+        watch = WatchConfig.standard(config, CONTROL_PERIOD_NS, image_px=runtime.image_px, semantic=semantic)
         sources = Sources(
-            failed_generations=lambda: self._reasoner.failed,
-            invalid_texts=lambda: self._reasoner.invalid_in_a_row,
+            failed_generations=lambda: self._reasoner.cycle.failed,
+            invalid_texts=lambda: self._reasoner.cycle.invalid_in_a_row,
             asleep_ns=lambda: 0,
         )
         self._loop = ControlLoop(
-            policy=seen,  # type: ignore[arg-type]  # the calls of a tick, with the delay that the mode tells
-            controller=Controller(config),
-            newest_frame=lambda: self._frame,
-            history=self._history,
-            ring=self._ring,
-            slot=self._slot,
-            sink=_NoBridge(),
-            recorder=None,
-            period_ns=CONTROL_PERIOD_NS,
-            step_s=runtime.step_s,
+            self._recording,  # type: ignore[arg-type]  # the two calls of a tick
+            ControlConfig(CONTROL_PERIOD_NS, runtime.step_s, semantic.trained_delay_s, switches),
+            ControlSources(lambda: self._frame, self._history),
+            shared,
+            CommandChain(Controller(config), Watch(watch, sources), Supervisor()),
+            ControlOutputs(_NoBridge()),
             stop=threading.Event(),
-            watch=Watch(watch, sources),
-            supervisor=Supervisor(),
-            switches=switches,
             clock=lambda: self._now_ns,
         )
         self.notes: dict[str, Any] = {}
@@ -173,7 +160,7 @@ class _Drive:
         self._frame = Frame(now_ns, fit_frame(image, self._image_px), b"")
         self._history.put(StampedPose(now_ns, observation.T_odom_base, *observation.state))
         self._reasoner.release(now_ns)
-        self._told.last = None
+        self._recording.last = None
         command = VelocityCommand(0.0, 0.0, 0.0, None, "stopped")
         if not self._loop.supervision.stop:
             command = self._loop.tick(now_ns)
@@ -182,11 +169,11 @@ class _Drive:
         return command.vx_mps, command.vy_mps, command.wz_radps
 
     def _note(self, command: VelocityCommand, now_ns: int) -> dict[str, Any]:
-        told, semantic, supervision = self._told.last, self._slot.state, self._loop.supervision
-        since_ns = self._reasoner.thinking_since_ns
+        latency, semantic, supervision = self._recording.last, self._slot.state, self._loop.supervision
+        since_ns = self._reasoner.started_ns
         return {
-            "delay_s": None if told is None else told[0],
-            "offset": None if told is None else list(told[1].as_tuple()),
+            "delay_s": None if latency is None else latency[0],
+            "offset": None if latency is None else list(latency[1].as_tuple()),
             "generation": None if semantic is None else semantic.generation,
             "text": "" if semantic is None else semantic.text,
             "waypoints": None if semantic is None else semantic.waypoints,
@@ -194,7 +181,7 @@ class _Drive:
             "reason": command.reason,
             "target": None if command.target is None else list(command.target.as_tuple()),
             "speed_scale": supervision.speed_scale,
-            "says": supervision.says or self._reasoner.failure or "",
+            "says": supervision.says or self._reasoner.cycle.failure or "",
             "stopped_by": supervision.active[0] if supervision.stop and supervision.active else "",
         }
 
@@ -206,8 +193,11 @@ class _Drive:
         ]
 
 
-class _DelayTold:
-    """The model as a tick calls it. Blocking: the world waits while it thinks, so delay and motion offset are zero."""
+class _RecordingPolicy:
+    """The model as a tick calls it; remembers its last latency input.
+
+    Blocking: the world waits during a generation, so delay and motion offset are zero.
+    """
 
     def __init__(self, model: Model, *, blocking: bool) -> None:
         self._model = model

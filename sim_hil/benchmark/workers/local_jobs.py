@@ -11,7 +11,7 @@ from sim_hil.benchmark.results.store import EPISODES
 from sim_hil.benchmark.workers.jobs import Ended
 from sim_hil.benchmark.workers.task import EpisodeTask
 from sim_hil.benchmark.workers.worker_pool import Workers
-from sim_hil.benchmark.workers.worker_process import Message
+from sim_hil.processes.child_process import Message
 
 ATTEMPTS = 2
 """Attempts per episode: one repetition if its process died."""
@@ -28,7 +28,7 @@ class LocalJobs:
             raise ConditionsError(f"--jobs: expected 1 or more, found {jobs}")
         self._workers = Workers(worker, jobs)
         self._times_s: dict[str, float] = {}
-        self._said: dict[str, Ended] = {}
+        self._results: dict[str, Ended] = {}
 
     def free(self) -> int:
         """Return the number of further processes that may start."""
@@ -47,13 +47,14 @@ class LocalJobs:
     def wait(self, timeout_s: float) -> Sequence[Ended]:
         """Return the attempts whose process has ended."""
         ended: list[Ended] = []
-        for told in self._workers.wait(timeout_s):
-            if told.message is not None:
-                self._understand(told.key, told.message)
+        for event in self._workers.wait(timeout_s):
+            if event.message is not None:
+                self._take(event.key, event.message)
                 continue
-            del self._times_s[told.key]
-            why = f"its process gave no result: {told.why or 'ended with exit code 0'}"
-            ended.append(self._said.pop(told.key) if told.key in self._said else Ended(told.key, why=why))
+            del self._times_s[event.key]
+            why = f"its process gave no result: {event.failure or 'ended with exit code 0'}"
+            known = event.key in self._results
+            ended.append(self._results.pop(event.key) if known else Ended(event.key, why=why))
         return ended
 
     def times_s(self) -> dict[str, float]:
@@ -65,15 +66,15 @@ class LocalJobs:
         self._workers.close()
         self._times_s.clear()
 
-    def _understand(self, name: str, content: Message) -> None:
-        """Process a worker's message; invalid messages are ignored."""
+    def _take(self, name: str, content: Message) -> None:
+        """Keep what a worker reports; ignore a message of any other form."""
         try:
             if "result" in content:
-                self._said[name] = Ended(name, result=EpisodeResult.of_json(content["result"]))
+                self._results[name] = Ended(name, result=EpisodeResult.of_json(content["result"]))
             elif "refused" in content:
-                self._said[name] = Ended(name, why=str(content["refused"]), refused_code=int(content["code"]))
+                self._results[name] = Ended(name, why=str(content["refused"]), refused_code=int(content["code"]))
             elif "failed" in content:
-                self._said[name] = Ended(name, why=str(content["failed"]))
+                self._results[name] = Ended(name, why=str(content["failed"]))
             else:
                 self._times_s[name] = float(content["time_s"])
         except (ValueError, KeyError, TypeError, ResultError):

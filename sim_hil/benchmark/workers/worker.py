@@ -18,7 +18,7 @@ from sim_hil.benchmark.workers.task import EpisodeTask
 from sim_hil.benchmark.workers.worker_process import line_to_parent
 from sim_hil.scene.scene import SceneError
 
-TELL_EVERY_NS = 500_000_000
+SEND_EVERY_NS = 500_000_000
 
 _BAD_INPUT = (ConditionsError, SuiteError, SceneError, ConfigError, InstructionError)
 
@@ -33,25 +33,25 @@ def refusal_of(error: Exception) -> tuple[str, int] | None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Read one task from standard input and run it; return 0 once the result or a refusal has been sent."""
-    with line_to_parent("python -m sim_hil.benchmark.workers.worker", argv) as tell:
-        told_ns = time.monotonic_ns()
+    """Read one task from standard input and run it; exit code 0 once the result or a refusal has been sent."""
+    with line_to_parent("python -m sim_hil.benchmark.workers.worker", argv) as send:
+        sent_ns = time.monotonic_ns()
 
-        def tell_time(time_s: float) -> None:
-            nonlocal told_ns
-            if time.monotonic_ns() - told_ns > TELL_EVERY_NS:
-                told_ns = time.monotonic_ns()
-                tell({"time_s": time_s})
+        def send_time(time_s: float) -> None:
+            nonlocal sent_ns
+            if time.monotonic_ns() - sent_ns > SEND_EVERY_NS:
+                sent_ns = time.monotonic_ns()
+                send({"time_s": time_s})
 
         try:
             task = EpisodeTask.of_json(json.loads(sys.stdin.read()))
-            tell({"result": run_episode(task, tell_time).as_json()})
+            send({"result": run_episode(task, send_time).as_json()})
         except (ArtifactError, *_BAD_INPUT) as error:
             line, code = refusal_of(error) or (str(error), EXIT_BAD_INPUT)
-            tell({"refused": line, "code": code})
+            send({"refused": line, "code": code})
         except ExternalError as error:
-            # The policy server ended or misbehaved: this attempt failed, but another may succeed.
-            tell({"failed": str(error)})
+            # A policy server that is gone or misbehaves: this run has failed, another attempt may not.
+            send({"failed": str(error)})
     return EXIT_DONE
 
 

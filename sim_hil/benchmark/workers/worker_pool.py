@@ -1,6 +1,6 @@
 """Pool of worker processes: a new interpreter per job, one core each, ended with the parent; messages are JSON.
 
-`sim_hil.benchmark.workers.worker_process` is the worker's side.
+The worker's side is `sim_hil.benchmark.workers.worker_process`.
 """
 
 from __future__ import annotations
@@ -8,54 +8,68 @@ from __future__ import annotations
 import json
 import os
 import selectors
-import signal
-import subprocess
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, field
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Final
+from typing import Any, Final
 
-from sim_hil.benchmark.workers.worker_process import SINGLE_THREADED, Message
+from sim_hil.benchmark.workers.worker_process import SINGLE_THREADED
+from sim_hil.processes.child_process import ChildProcess, Message, exit_text, last_lines, parse_message
 
 GRACE_S: Final = 2.0
+"""Time from SIGTERM to SIGKILL, s."""
 SILENT_S: Final = 3600.0
-"""Time without a message after which a worker counts as hanging, s."""
+"""Time without a message after which a worker counts as hung and is killed, s."""
 _TAIL_CHARS: Final = 400
 _GREETING: Final = "pybullet build time"  # printed by every process that loads the engine
 _EXIT_POLL_S: Final = 0.05
+_POLL_S: Final = 0.5
 
 
 @dataclass(frozen=True)
-class Told:
-    """Event of a worker; `message` is None once it has ended, and `why` explains a failure."""
+class WorkerEvent:
+    """A message of a worker, or its end: then `message` is None, and `failure` says how it ended if not well."""
 
     key: str
     message: Message | None
-    why: str = ""
+    failure: str = ""
+
+
+@dataclass(frozen=True)
+class WorkerJob:
+    """One job: its name among the jobs, its content as JSON values, and the file for what its process prints."""
+
+    key: str
+    content: Mapping[str, Any]
+    log: Path
 
 
 @dataclass
 class _Worker:
     key: str
-    process: subprocess.Popen[bytes]
-    lines: IO[bytes]
+    process: ChildProcess
     log: Path
-    heard_ns: int
-    buffer: bytearray = field(default_factory=bytearray)
-    at_end: bool = False
+    last_message_ns: int
+    registered: bool = True
 
 
 class Workers:
-    """Pool of up to `jobs` parallel processes of `command`."""
+    """Up to `jobs` processes of `command` at a time; 0 jobs: one per core. All are ended when the block is left."""
 
     def __init__(self, command: Sequence[str], jobs: int) -> None:
-        if jobs < 1:
-            raise ValueError(f"workers: expected 1 job or more, found {jobs}")
-        self._command, self._jobs = command, jobs
+        if jobs < 0:
+            raise ValueError(f"workers: expected 0 jobs or more, found {jobs}")
+        self._command, self._jobs = command, jobs or len(os.sched_getaffinity(0))
         self._running: dict[str, _Worker] = {}
         self._selector = selectors.DefaultSelector()
+
+    def __enter__(self) -> Workers:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def free(self) -> int:
         """Return the number of further processes that may start."""
@@ -69,50 +83,42 @@ class Workers:
         """Return the process id of every running job."""
         return {key: worker.process.pid for key, worker in self._running.items()}
 
-    def start(self, key: str, job: Mapping[str, object], log: Path) -> None:
-        """Start a process for a job; its output is in `log` until it succeeds. Raises OSError."""
-        reading, writing = os.pipe()
-        try:
-            with log.open("wb") as output:
-                process = subprocess.Popen(
-                    [*self._command, "--fd", str(writing), "--parent", str(os.getpid())],
-                    stdin=subprocess.PIPE,
-                    stdout=output,
-                    stderr=output,
-                    pass_fds=(writing,),
-                    env={**os.environ, **SINGLE_THREADED},
-                    start_new_session=True,  # Ctrl-C is for the parent, which ends its workers itself
-                )
-        except BaseException:
-            os.close(reading)
-            raise
-        finally:
-            os.close(writing)
-        os.set_blocking(reading, False)
-        worker = _Worker(key, process, os.fdopen(reading, "rb", buffering=0), log, time.monotonic_ns())
-        self._running[key] = worker
-        self._selector.register(worker.lines, selectors.EVENT_READ, worker)
-        stdin = process.stdin
-        if stdin is not None:
-            with suppress(BrokenPipeError):  # it has already died, which `wait` detects
-                stdin.write(json.dumps(job).encode())
-            with suppress(BrokenPipeError):
-                stdin.close()
+    def run(self, waiting: deque[WorkerJob], stopped: Callable[[], bool]) -> Iterator[list[WorkerEvent]]:
+        """Run all jobs, also those appended to `waiting` meanwhile; yields the events of each half second.
 
-    def wait(self, timeout_s: float) -> list[Told]:
-        """Wait until a worker reports or the time is over; return the events since the last call."""
-        if any(worker.at_end for worker in self._running.values()):
+        Raises OSError when a process cannot be started, KeyboardInterrupt when `stopped`.
+        """
+        while waiting or self._running:
+            if stopped():
+                raise KeyboardInterrupt
+            while waiting and self.free() > 0:
+                job = waiting.popleft()
+                self.start(job.key, job.content, job.log)
+            yield self.wait(_POLL_S)
+
+    def start(self, key: str, job: Mapping[str, object], log: Path) -> None:
+        """Start a process on a job; what it prints is in `log` until it ends well. Raises OSError."""
+        process = ChildProcess(self._command, log=log, own_pipe=True, env=SINGLE_THREADED, new_session=True)
+        worker = self._running[key] = _Worker(key, process, log, time.monotonic_ns())
+        self._selector.register(process, selectors.EVENT_READ, worker)
+        process.send(json.dumps(job).encode())  # one that has died already is found by `wait`
+        process.close_input()
+
+    def wait(self, timeout_s: float) -> list[WorkerEvent]:
+        """Events since the last call; waits until there is one or the time is over."""
+        if any(worker.process.at_end for worker in self._running.values()):
             timeout_s = min(timeout_s, _EXIT_POLL_S)
-        told: list[Told] = []
+        events: list[WorkerEvent] = []
         for key, _ in self._selector.select(timeout_s):
-            told += self._read(key.data)
+            events += self._read(key.data)
         for worker in list(self._running.values()):
-            if time.monotonic_ns() - worker.heard_ns > SILENT_S * 1e9:
+            if time.monotonic_ns() - worker.last_message_ns > SILENT_S * 1e9:
                 worker.process.kill()
-            if worker.process.poll() is not None:
-                told += self._read(worker)
-                told.append(self._finish(worker))
-        return told
+            code = worker.process.poll()
+            if code is not None:
+                events += self._read(worker)
+                events.append(self._finish(worker, code))
+        return events
 
     def close(self) -> None:
         """End all processes: SIGTERM, then SIGKILL."""
@@ -120,52 +126,33 @@ class Workers:
             worker.process.terminate()
         deadline_ns = time.monotonic_ns() + round(GRACE_S * 1e9)
         for worker in self._running.values():
-            try:
-                worker.process.wait(max(0.0, (deadline_ns - time.monotonic_ns()) / 1e9))
-            except subprocess.TimeoutExpired:
-                worker.process.kill()
-                worker.process.wait()
-            worker.lines.close()
+            worker.process.close(max(0.0, (deadline_ns - time.monotonic_ns()) / 1e9))
         self._running.clear()
         self._selector.close()
 
-    def _read(self, worker: _Worker) -> list[Told]:
-        while not worker.at_end and (data := worker.lines.read(1 << 16)) is not None:  # None: nothing yet
-            worker.buffer += data
-            worker.heard_ns = time.monotonic_ns()
-            if not data:  # a pipe at its end is always readable: left registered, it would wake `wait` at once for ever
-                worker.at_end = True
-                self._selector.unregister(worker.lines)
-        *whole, rest = bytes(worker.buffer).split(b"\n")
-        worker.buffer[:] = rest
-        return [Told(worker.key, message) for line in whole if (message := _message(line)) is not None]
+    def _read(self, worker: _Worker) -> list[WorkerEvent]:
+        lines = worker.process.read()
+        if lines:
+            worker.last_message_ns = time.monotonic_ns()
+        if worker.process.at_end:  # a pipe at its end is always readable: it would end every `wait` at once
+            self._unregister(worker)
+        return [WorkerEvent(worker.key, message) for line in lines if (message := parse_message(line)) is not None]
 
-    def _finish(self, worker: _Worker) -> Told:
+    def _unregister(self, worker: _Worker) -> None:
+        if worker.registered:
+            self._selector.unregister(worker.process)
+        worker.registered = False
+
+    def _finish(self, worker: _Worker, code: int) -> WorkerEvent:
         del self._running[worker.key]
-        if not worker.at_end:  # a process that the worker has left behind holds its end open
-            self._selector.unregister(worker.lines)
-        worker.lines.close()
-        code = worker.process.returncode
+        self._unregister(worker)  # a process that the worker has left behind may hold the pipe open
+        worker.process.close(0.0)
         if code == 0:
             worker.log.unlink(missing_ok=True)
-            return Told(worker.key, None)
-        how = f"ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
-        return Told(worker.key, None, f"{how}{_tail(worker.log)}")
+            return WorkerEvent(worker.key, None)
+        return WorkerEvent(worker.key, None, f"{exit_text(code)}{_last_line(worker.log)}")
 
 
-def _message(line: bytes) -> Message | None:
-    """Parse a line; None if it is invalid, such as one torn by a dying process."""
-    try:
-        content = json.loads(line)
-    except ValueError:
-        return None
-    return content if isinstance(content, dict) else None
-
-
-def _tail(log: Path) -> str:
-    try:
-        text = log.read_text(encoding="utf-8", errors="replace")[-_TAIL_CHARS:]
-    except OSError:
-        return ""
-    last = [line.strip() for line in text.splitlines() if line.strip() and not line.startswith(_GREETING)]
-    return f": {last[-1]}" if last else ""
+def _last_line(log: Path) -> str:
+    lines = [line.strip() for line in last_lines(log) if not line.startswith(_GREETING)]
+    return f": {lines[-1][-_TAIL_CHARS:]}" if lines else ""

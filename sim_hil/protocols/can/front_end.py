@@ -185,7 +185,7 @@ class CanFrontEnd:
         return f"CAN {self._address}, {camera}"
 
     def start(self, render_state: NDArray[np.float64], stop: Sequence[int]) -> bool:
-        """Wait for the camera. Raises CameraStreamError."""
+        """Wait for the camera. Raises CameraProcessError."""
         if self._camera is None:
             return True
         self._camera.show(render_state)
@@ -206,7 +206,7 @@ class CanFrontEnd:
                 self._handle(frame, received_ns)
         self._handle_delayed()
         if self._camera is not None:
-            self._camera.poll()
+            self._camera.events()
         commands, self._commands = self._commands, []
         return commands
 

@@ -160,7 +160,7 @@ class MavlinkFrontEnd:
         return f"MAVLink udp:{self._host}:{self._link.port}, system {self._node.system}, {camera}"
 
     def start(self, render_state: NDArray[np.float64], stop: Sequence[int]) -> bool:
-        """Wait for the camera. Raises CameraStreamError."""
+        """Wait for the camera. Raises CameraProcessError."""
         if self._camera is None:
             return True
         self._camera.show(render_state)
@@ -183,7 +183,7 @@ class MavlinkFrontEnd:
                     commands += self._handle(message, address, received_ns)
         self._flush(self._node.answers())
         if self._camera is not None:
-            self._camera.poll()
+            self._camera.events()
         return commands
 
     def _handle(self, message: Message, address: Address, received_ns: int) -> list[ReceivedCommand]:

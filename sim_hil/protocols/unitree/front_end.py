@@ -122,7 +122,7 @@ class UnitreeFrontEnd:
 
     def _tell_camera(self, line: bytes) -> None:
         if self._camera is not None:
-            self._camera.tell(line)
+            self._camera.send(line)
 
     def where(self) -> str:
         """Return DDS domain and interface."""

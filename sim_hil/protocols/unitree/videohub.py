@@ -9,16 +9,15 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
-import os
-import select
+import functools
 import signal
 import sys
-from typing import Final, TextIO
+from typing import Final
 
 from firmware_bridge.core.config import DdsConfig
 from firmware_bridge.unitree.dds import Bus
 from firmware_bridge.unitree.messages import ids
+from sim_hil.processes.child_process import input_is_open, take_standard_output, write_message
 from sim_hil.protocols.snapshot import SnapshotReader
 from sim_hil.protocols.unitree.services.service import ServiceServer
 from sim_hil.protocols.unitree.video_service import VideoHub, encode_jpeg
@@ -28,13 +27,6 @@ from sim_hil.simulation.sensor_noise import SensorNoise
 
 _PARENT_CHECK_NS: Final = 50_000_000
 _FAULTS_CHECK_NS: Final = 5_000_000  # a fault takes effect, and a held answer leaves, within this
-
-
-def _event_pipe() -> TextIO:
-    """The pipe to the parent, for us alone: what a library prints to stdout goes to stderr from now on."""
-    pipe = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    return pipe
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -54,11 +46,7 @@ def main(argv: list[str] | None = None) -> int:
     # A Ctrl-C reaches the whole process group; the parent decides when the camera ends.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
-    pipe = _event_pipe()
-
-    def tell(event: dict[str, object]) -> None:
-        pipe.write(json.dumps(event) + "\n")
-        pipe.flush()
+    tell = functools.partial(write_message, take_standard_output())
 
     world = CameraWorld(load_scene(args.scene), people=args.people, seed=args.seed)
     poses = SnapshotReader(args.pose_fd, world.state_size)
@@ -72,7 +60,7 @@ def main(argv: list[str] | None = None) -> int:
     bus = Bus(DdsConfig(args.domain, args.interface, tuple(args.peer)))
     server = ServiceServer(bus, ids.VIDEO_SERVICE)
     waitset = bus.waitset(server.reader)
-    hub, alive, check_ns = VideoHub(server, render, tell), _parent_lives, _PARENT_CHECK_NS
+    hub, alive, check_ns = VideoHub(server, render, tell), input_is_open, _PARENT_CHECK_NS
     if args.faults:
         from sim_hil.protocols.unitree.camera_faults import FaultyVideoHub  # not loaded where no fault may be injected
 
@@ -86,10 +74,6 @@ def main(argv: list[str] | None = None) -> int:
             waitset.wait(check_ns)
             hub.serve()
     return 0
-
-
-def _parent_lives() -> bool:
-    return not select.select([sys.stdin], [], [], 0)[0]
 
 
 if __name__ == "__main__":

@@ -16,16 +16,18 @@ from edge.flightlog.reader import read_messages
 from edge.flightlog.recorder import Recorder
 from edge.flightlog.replay.command import main
 from edge.flightlog.schemas import SCHEMAS
+from edge.inference.generation_task import GenerationModels
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
 from edge.motion.controller import Controller, ControllerConfig
+from edge.reasoning.generation_cycle import Mode, ReasoningConfig
 from edge.run.camera import decode_frame
-from edge.run.control_loop import ControlLoop
-from edge.run.reasoning_loop import Mode, ReasoningLoop
+from edge.run.control_loop import CommandChain, ControlConfig, ControlLoop, ControlOutputs, ControlSources
+from edge.run.reasoning_loop import ReasoningLoop, ReasoningOutputs, ReasoningSchedule
 from edge.state.frame import Frame
 from edge.state.pose_history import PoseHistory, StampedPose
 from edge.state.ring import TokenRing
-from edge.state.semantic import SemanticSlot
+from edge.state.semantic import SemanticSlot, SharedState
 from firmware_bridge.core.config import LimitsConfig
 from tests.edge.flightlog.test_log_schemas import complaints
 from tests.support.runner import synthetic_run
@@ -54,32 +56,24 @@ def drive(artifacts: Artifacts, recorder: Recorder, mode: Mode) -> None:
     policy, language = Policy(artifacts), LanguageModel(artifacts)
     slot, ring, history, stop = SemanticSlot(), TokenRing(130), PoseHistory(), threading.Event()
     frame: Frame | None = None
+    shared = SharedState(ring, slot)
     reasoning = ReasoningLoop(
-        language=language,
-        policy=policy,
-        ring=ring,
-        slot=slot,
-        instruction="walk down the corridor",
-        frame_offsets_s=runtime.frame_offsets_s,
-        max_new_tokens=6,
-        release_delay_s=lambda: 0.0,
-        recorder=recorder,
+        GenerationModels(language, policy),
+        shared,
+        ReasoningConfig(runtime.frame_offsets_s, 6, mode),
+        "walk down the corridor",
         stop=stop,
-        mode=mode,
-        late_anchor=False,
+        schedule=ReasoningSchedule(late_anchor=False),
+        outputs=ReasoningOutputs(recorder),
         clock=lambda: now_ns,
     )
     control = ControlLoop(
-        policy=policy,
-        controller=Controller(ControllerConfig(LIMITS, runtime.step_s, 500, 200)),
-        newest_frame=lambda: frame,
-        history=history,
-        ring=ring,
-        slot=slot,
-        sink=Sink(),  # type: ignore[arg-type]
-        recorder=recorder,
-        period_ns=TICK_NS,
-        step_s=runtime.step_s,
+        policy,
+        ControlConfig(TICK_NS, runtime.step_s),
+        ControlSources(lambda: frame, history),
+        shared,
+        CommandChain.standard(Controller(ControllerConfig(LIMITS, runtime.step_s, 500, 200)), TICK_NS),
+        ControlOutputs(Sink(), recorder),  # type: ignore[arg-type]
         stop=stop,
         clock=lambda: now_ns,
     )

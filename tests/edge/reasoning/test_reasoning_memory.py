@@ -9,16 +9,17 @@ from functools import partial
 import pytest
 
 from edge.core.geometry import SE2
+from edge.inference.generation_task import GenerationModels
 from edge.reasoning.decoding_rules import BACK, DONE, EITHER_WAY, FREE, MAX_REFUSALS, ONWARD, TurnObservation
+from edge.reasoning.generation_cycle import Mode, ReasoningConfig
 from edge.reasoning.instruction_state import InstructionMemory
 from edge.reasoning.path_memory import PathMemory, Way, way_of
-from edge.run.reasoning_loop import Mode
 from edge.state.reasoning_budget import ReasoningBudget
 from edge.state.reasoning_text import LEFT, RIGHT, Progress
 from edge.state.ring import EncodedFrame, TokenRing
-from edge.state.semantic import SemanticSlot
+from edge.state.semantic import SemanticSlot, SharedState
 from sim_hil.benchmark.conditions.latency import Timing
-from sim_hil.benchmark.policies.lockstep_reasoner import LockstepReasoner
+from sim_hil.benchmark.policies.lockstep_reasoner import VirtualTimeReasoner
 from tests.support.runner.reasoning_bench import KV, Bench, Clock, FakeLanguage, FakePolicy
 
 TICK_NS = 100_000_000
@@ -89,24 +90,12 @@ def lockstep(
 ) -> FakeLanguage:
     """Ticks of the benchmark's reasoner."""
     language, ring, slot = of(FakeLanguage()), TokenRing(160), slot or SemanticSlot()
-    begin = language.begin
-    language.begin = lambda cancelled: begin(  # type: ignore[method-assign, assignment, misc]
-        cancelled,
-        interrupt=None,
-        before_call=lambda _: None,  # type: ignore[arg-type]
-    )
-    policy = FakePolicy()
-    policy.semantic_context = lambda kv, interrupt=None: {"context.0.key": kv}  # type: ignore[method-assign]
-    reasoner = LockstepReasoner(
-        language=language,  # type: ignore[arg-type]
-        policy=policy,  # type: ignore[arg-type]
-        ring=ring,
-        slot=slot,
-        instruction=instruction,
-        frame_offsets_s=(0.0, 3.0),
-        max_new_tokens=4,
-        draw=lambda: Timing(round(latency_s * 1e9), 0),
-        mode=Mode.ASYNC,
+    reasoner = VirtualTimeReasoner(
+        GenerationModels(language, FakePolicy()),  # type: ignore[arg-type]
+        SharedState(ring, slot),
+        ReasoningConfig((0.0, 3.0), 4),
+        instruction,
+        lambda: Timing(round(latency_s * 1e9), 0),
     )
     for tick in range(ticks):
         now_ns = frame_at(tick).stamp_ns
@@ -254,7 +243,7 @@ def test_a_failed_generation_changes_nothing() -> None:
     think_at(bench, 2.0)
     bench.language.text, bench.language.broken = "Progress: last leg of 3, passed 0." + LINE, 1
     bench.frame(3.0)
-    assert not bench.loop.step() and bench.loop.failed == 1
+    assert not bench.loop.step() and bench.cycle.failed == 1
     clock.s += 1.0
     bench.language.text = FIRST
     assert think_at(bench, 4.0) == (((-2.0, 0.0),), Progress(1, 3, 2))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
 
 from edge.core.geometry import SE2
 from edge.motion.recovery import BACKING_OFF, TURNING
+from edge.run.control_loop import ControlConfig
 from edge.safety.faults.findings import Finding
 from edge.safety.faults.table import FAULT_OF_CAUSE
 from edge.state.pose_history import StampedPose
@@ -231,3 +233,22 @@ def test_a_robot_whose_plan_stands_turns_to_where_its_words_lead_and_speeds_up_f
 def test_words_that_wait_for_somebody_let_it_stand() -> None:
     text = "Plan: wait, then turn right.\nwaypoints: (1.0, -1.0) (1.0, -2.0) (1.0, -4.0)"
     assert {reason for reason, _ in stand_and_hear(Bench(), text, 100)} == {"ok"}
+
+
+@pytest.mark.parametrize(("age_s", "given_s"), [(-0.5, 0.0), (0.0, 0.0), (4.0, 4.0), (10.0, 10.0), (13.0, 10.0)])
+def test_the_policys_delay_input_is_between_zero_and_what_it_was_trained_for(
+    bench: Bench, age_s: float, given_s: float
+) -> None:
+    bench.see()
+    bench.think(age_s=age_s)
+    state = bench.slot.state
+    assert state is not None
+    assert state.latency_input(bench.now_ns, SE2(0.0, 0.0, 0.0), 10.0).delay_s == pytest.approx(given_s)
+
+
+@pytest.mark.parametrize(
+    ("period_ns", "step_s", "trained_s"), [(0, 0.1, 10.0), (1, 0.0, 10.0), (1, math.nan, 10.0), (1, 0.1, math.inf)]
+)
+def test_a_rate_or_limit_that_cannot_be_is_refused(period_ns: int, step_s: float, trained_s: float) -> None:
+    with pytest.raises(ValueError, match="expected a period, step and trained delay above 0"):
+        ControlConfig(period_ns, step_s, trained_s)

@@ -8,9 +8,10 @@ from collections.abc import Callable
 
 import pytest
 
-from edge.core.geometry import SE2
+from edge.reasoning.decoding_rules import DecodingContext
 from edge.run.reasoning_loop import ReasoningLoop
-from tests.support.runner.reasoning_bench import Bench, Clock, FakeRun
+from edge.state.switches import Decoding
+from tests.support.runner.reasoning_bench import TEXT, Bench, Clock, FakeRun
 
 
 @pytest.fixture
@@ -24,17 +25,6 @@ def bench(clock: Clock) -> Bench:
 
 
 # A semantic state
-
-
-def test_a_state_carries_the_stamp_and_pose_of_its_newest_frame(bench: Bench) -> None:
-    bench.frame(2.0)
-    assert bench.loop.step()
-    state = bench.slot.state
-    assert state is not None
-    assert state.anchor_ns == 2_000_000_000
-    assert state.T_odom_anchor == SE2(2.0, 0.0, 0.0)
-    assert state.waypoints == ((1.0, 0.0), (2.0, 0.0), (3.0, 0.0))
-    assert [part[0, 0, 0] for part in state.context.values()] == [1.0, 2.0]
 
 
 def test_the_same_frame_is_not_thought_about_twice(bench: Bench) -> None:
@@ -57,7 +47,7 @@ def test_delay_at_release_counts_from_the_capture_of_the_newest_frame(bench: Ben
     bench.language.during_finish = think
     bench.frame(99.8)
     bench.loop.step()
-    assert bench.loop.anchor_to_ready_ms.newest == pytest.approx(1700.0)
+    assert bench.loop.times.anchor_to_ready_ms.newest == pytest.approx(1700.0)
     assert bench.slot.state is not None and bench.slot.state.ready_ns == clock()
 
 
@@ -75,14 +65,14 @@ def test_a_finished_generation_is_held_back_by_the_release_delay() -> None:
     with Bench(delay_s=0.3) as bench:
         started = time.monotonic()
         bench.frame(2.0)
-        bench.wait_for(lambda: bench.loop.generations == 1)
+        bench.wait_for(lambda: bench.cycle.published == 1)
         assert time.monotonic() - started >= 0.3
 
 
 def test_until_the_new_state_is_released_the_old_one_stays() -> None:
     with Bench(delay_s=0.2) as bench:
         bench.frame(2.0)
-        bench.wait_for(lambda: bench.loop.generations == 1)
+        bench.wait_for(lambda: bench.cycle.published == 1)
         first = bench.slot.state
         bench.frame(3.0)
         bench.wait_for(lambda: len(bench.language.prompts) == 2)
@@ -95,7 +85,7 @@ def test_a_stop_ends_a_generation_that_is_held_back() -> None:
         bench.frame(2.0)
         bench.wait_for(lambda: len(bench.language.prompts) == 1)
     assert bench.slot.state is None
-    assert bench.loop.cancelled == 0
+    assert bench.cycle.cancelled == 0
 
 
 # The queue of one
@@ -113,7 +103,7 @@ def test_a_new_instruction_ends_the_generation_under_way_and_is_followed_next(be
     assert not bench.loop.step()
     bench.frame(2.1)
     assert bench.loop.step()
-    assert (bench.loop.cancelled, bench.language.instructions) == (1, ["right"])
+    assert (bench.cycle.cancelled, bench.language.instructions) == (1, ["right"])
 
 
 def test_a_cancelled_generation_begins_again_with_the_newest_frames(bench: Bench) -> None:
@@ -135,7 +125,18 @@ def test_an_instruction_given_between_two_generations_interrupts_neither(bench: 
     bench.loop.submit("left")
     bench.frame(3.0)
     assert bench.loop.step()
-    assert (bench.loop.cancelled, bench.language.instructions) == (0, ["go", "left"])
+    assert (bench.cycle.cancelled, bench.language.instructions) == (0, ["go", "left"])
+
+
+def test_a_new_instruction_is_decoded_as_freely_as_the_first(clock: Clock) -> None:
+    bench = Bench(clock=clock, decoding=Decoding.FREE)
+    bench.loop.submit("left")
+    bench.language.text = "Progress: turn 2 of 3, passed 0.\n" + TEXT
+    for second in (2.0, 3.0):
+        bench.frame(second)
+        assert bench.loop.step()
+    context = bench.language.contexts[-1]
+    assert context.before is not None and context == DecodingContext(context.before)
 
 
 # Late anchor
@@ -157,7 +158,7 @@ def test_older_frames_are_prefilled_before_the_newest_is_captured(bench: Bench, 
     clock.s = 100.9
     bench.loop.step()
     assert bench.language.prompts[1] == pytest.approx([98.3, 101.3])
-    assert bench.loop.late_anchor_ms.newest == pytest.approx(400.0)
+    assert bench.loop.times.late_anchor_ms.newest == pytest.approx(400.0)
 
 
 def test_without_late_anchor_the_newest_frame_is_that_of_the_beginning(clock: Clock) -> None:
@@ -167,7 +168,7 @@ def test_without_late_anchor_the_newest_frame_is_that_of_the_beginning(clock: Cl
         bench.frame(tenth / 10)
     bench.loop.step()
     assert bench.language.prompts == [[97.0, 100.0]]
-    assert bench.loop.late_anchor_ms.newest == 0.0
+    assert bench.loop.times.late_anchor_ms.newest == 0.0
 
 
 def test_the_newest_frame_is_waited_for_until_its_planned_instant() -> None:
@@ -175,13 +176,13 @@ def test_the_newest_frame_is_waited_for_until_its_planned_instant() -> None:
         for tenth in range(70, 101):
             bench.frame(tenth / 10)
         bench.language.during_feed = lambda: time.sleep(0.3)
-        bench.wait_for(lambda: bench.loop.generations == 1)
+        bench.wait_for(lambda: bench.cycle.published == 1)
         bench.language.during_feed = lambda: None
         bench.frame(10.1)
         time.sleep(0.1)
-        assert bench.loop.generations == 1
+        assert bench.cycle.published == 1
         bench.frame(10.4)
-        bench.wait_for(lambda: bench.loop.generations == 2)
+        bench.wait_for(lambda: bench.cycle.published == 2)
         assert bench.language.prompts[1][-1] == pytest.approx(10.4)
 
 
@@ -199,7 +200,7 @@ def test_one_slow_prefill_does_not_make_the_next_generation_wait(bench: Bench, c
         bench.frame(clock.s)
         bench.language.during_feed = prefill
         assert bench.loop.step()
-    assert bench.loop.late_anchor_ms.newest == pytest.approx(200.0)
+    assert bench.loop.times.late_anchor_ms.newest == pytest.approx(200.0)
 
 
 def test_when_prefill_takes_far_longer_than_planned_the_spacing_is_kept(bench: Bench, clock: Clock) -> None:
@@ -227,8 +228,8 @@ def test_a_generation_is_given_up_when_no_frame_was_captured_around_the_planned_
     bench.frame(102.1)
     bench.language.during_feed = lambda: bench.frame(120.0)
     assert not bench.loop.step()
-    assert (len(bench.language.prompts), bench.loop.missed_frames) == (1, 1)
-    assert bench.loop.failed == 0
+    assert (len(bench.language.prompts), bench.cycle.missed_frames) == (1, 1)
+    assert bench.cycle.failed == 0
 
 
 # What a supervisor sees
@@ -258,20 +259,11 @@ def test_every_generation_is_in_the_statistics(bench: Bench, clock: Clock) -> No
     for second in range(3):
         bench.frame(float(second))
         bench.loop.step()
-    assert {len(bench.loop.generation_ms), len(bench.loop.anchor_to_ready_ms), len(bench.loop.late_anchor_ms)} == {3}
-
-
-def test_a_policy_that_reads_waypoints_keeps_the_last_ones_when_a_text_has_none(bench: Bench, clock: Clock) -> None:
-    bench.policy.guided_by_waypoints = True
-    bench.frame(2.0)
-    bench.loop.step()
-    good = bench.slot.state
-    assert good is not None and good.waypoints is not None
-    bench.language.text = "no waypoints here"
-    bench.frame(3.0)
-    assert not bench.loop.step()
-    assert bench.slot.state is good
-    assert (bench.loop.invalid_texts, bench.loop.failed) == (1, 0)
+    assert {
+        len(bench.loop.times.generation_ms),
+        len(bench.loop.times.anchor_to_ready_ms),
+        len(bench.loop.times.late_anchor_ms),
+    } == {3}
 
 
 def test_the_time_spent_computing_is_counted(bench: Bench, clock: Clock) -> None:
@@ -346,10 +338,10 @@ def test_a_frame_that_never_comes_is_not_waited_for_for_ever(bench: Bench, clock
     camera_stops(bench, clock)
     started_s = clock.s
     assert not bench.loop.step()
-    assert bench.loop.missed_frames == 1
+    assert bench.cycle.missed_frames == 1
     assert clock.s - started_s == pytest.approx(2.0 + 2.0 + 0.5 + 1.0, abs=0.1)
     assert not bench.loop.step(), "nothing to do until there is another frame"
-    assert bench.loop.missed_frames == 1
+    assert bench.cycle.missed_frames == 1
 
 
 def test_waiting_for_a_frame_is_not_computing(bench: Bench, clock: Clock) -> None:

@@ -14,11 +14,11 @@ import pytest
 
 from edge.core.deadline import Deadline
 from edge.inference.release import ReleaseDelay
+from edge.reasoning.generation_cycle import Mode
 from edge.run import assembly
 from edge.run import session as module
 from edge.run.arming import RefusedError, StoppedEarlyError
 from edge.run.assembly import Loops, RunOptions
-from edge.run.reasoning_loop import Mode
 from edge.run.session import RunSession
 from firmware_bridge.client import BridgeUnavailable
 from firmware_bridge.core.config import load_robot_config

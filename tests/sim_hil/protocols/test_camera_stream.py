@@ -133,7 +133,7 @@ def test_the_process_shows_the_world_at_the_pose_it_was_given(state: np.ndarray)
         deadline = time.monotonic() + 10
         while camera.pictures < 2:
             assert time.monotonic() < deadline
-            camera.poll()
+            camera.events()
     finally:
         camera.close()
         camera.close()

@@ -16,7 +16,7 @@ from sim_hil.benchmark.conditions.conditions import Conditions, PolicySpec
 from sim_hil.benchmark.results.record import EpisodeResult
 from sim_hil.benchmark.suite.episode import Episode
 from sim_hil.benchmark.workers.task import EpisodeTask
-from sim_hil.benchmark.workers.worker_process import end_with_parent
+from sim_hil.processes.child_process import end_with_parent
 
 STILL = Conditions(PolicySpec("still"))
 

@@ -9,15 +9,16 @@ import numpy as np
 from edge.core.geometry import SE2
 from edge.inference.graph import GraphError
 from edge.motion.controller import Controller, ControllerConfig
-from edge.run.control_loop import ControlLoop
+from edge.run.control_loop import CommandChain, ControlConfig, ControlLoop, ControlOutputs, ControlSources
 from edge.safety.faults.findings import FindingQueue
 from edge.safety.monitors.semantic import SemanticConfig
 from edge.safety.monitors.watch import Sources, Watch, WatchConfig
+from edge.safety.supervisor import Supervisor
 from edge.state.frame import Frame
 from edge.state.pose_history import PoseHistory, StampedPose
 from edge.state.reasoning_text import parse_waypoints
 from edge.state.ring import TokenRing
-from edge.state.semantic import SemanticSlot, SemanticState
+from edge.state.semantic import SemanticSlot, SemanticState, SharedState
 from edge.state.switches import Switches
 from firmware_bridge.core.config import LimitsConfig
 from firmware_bridge.core.link import BridgeStatus
@@ -131,20 +132,13 @@ class Bench:
         )
         config = WatchConfig.standard(controller, PERIOD_NS, image_px=PX, semantic=semantic)
         self.loop = ControlLoop(
-            policy=self.policy,  # type: ignore[arg-type]
-            controller=Controller(controller),
-            newest_frame=lambda: self.frame,
-            history=self.history,
-            ring=self.ring,
-            slot=self.slot,
-            sink=self.sink,
-            recorder=None,
-            period_ns=PERIOD_NS,
-            step_s=0.1,
+            self.policy,  # type: ignore[arg-type]
+            ControlConfig(PERIOD_NS, 0.1, config.semantic.trained_delay_s, switches or Switches()),
+            ControlSources(lambda: self.frame, self.history),
+            SharedState(self.ring, self.slot),
+            CommandChain(Controller(controller), Watch(config, sources), Supervisor()),
+            ControlOutputs(self.sink, on_tick=self.on_time.append),
             stop=self.stop,
-            watch=Watch(config, sources),
-            on_tick=self.on_time.append,
-            switches=switches,
             clock=lambda: self.now_ns,
         )
         self.loop.last_seq = 7

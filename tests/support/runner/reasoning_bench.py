@@ -11,16 +11,19 @@ from typing import cast
 import numpy as np
 
 from edge.core.geometry import SE2
+from edge.inference.generation_task import GenerationModels
 from edge.inference.graph import CancelledError, GraphError, Interrupt
 from edge.inference.language import Generation
 from edge.inference.scheduling import Role
 from edge.reasoning.decoding_rules import DecodingContext, TurnObservation
+from edge.reasoning.generation_cycle import Mode, ReasoningConfig
 from edge.reasoning.path_memory import Way
-from edge.run.reasoning_loop import ReasoningLoop
+from edge.run.reasoning_loop import ReasoningLoop, ReasoningOutputs, ReasoningSchedule
 from edge.state.reasoning_budget import ReasoningBudget
 from edge.state.reasoning_text import Progress
 from edge.state.ring import EncodedFrame, TokenRing
-from edge.state.semantic import SemanticSlot
+from edge.state.semantic import SemanticSlot, SharedState
+from edge.state.switches import Decoding
 
 KV = np.zeros((1, 5, 8), dtype=np.float32)
 TEXT = "Clear.\nwaypoints: (1.0, 0.0) (2.0, 0.0) (3.0, 0.0)"
@@ -41,7 +44,7 @@ class FakePrompt:
 
 
 class FakeRun:
-    def __init__(self, language: FakeLanguage, cancelled: Callable[[], bool], interrupt: Interrupt) -> None:
+    def __init__(self, language: FakeLanguage, cancelled: Callable[[], bool], interrupt: Interrupt | None) -> None:
         self.language, self.cancelled, self.interrupt = language, cancelled, interrupt
         self.parts: list[object] = []
 
@@ -113,7 +116,11 @@ class FakeLanguage:
         return FakeConstraint(self)
 
     def begin(
-        self, cancelled: Callable[[], bool], *, interrupt: Interrupt, before_call: Callable[[int], None]
+        self,
+        cancelled: Callable[[], bool],
+        *,
+        interrupt: Interrupt | None = None,
+        before_call: Callable[[int], None] | None = None,
     ) -> FakeRun:
         return FakeRun(self, cancelled, interrupt)
 
@@ -121,14 +128,23 @@ class FakeLanguage:
 class FakePolicy:
     guided_by_waypoints = False
 
-    def semantic_context(self, last_layer_kv: np.ndarray, interrupt: Interrupt) -> dict[str, np.ndarray]:
+    def semantic_context(self, last_layer_kv: np.ndarray, interrupt: Interrupt | None = None) -> dict[str, np.ndarray]:
         return {"context.0.key": last_layer_kv + 1, "context.0.value": last_layer_kv + 2}
 
 
 class Bench:
     """A reasoning loop with frames and a clock that the test provides; a thread only inside `with`."""
 
-    def __init__(self, delay_s: float = 0.0, **more: object) -> None:
+    def __init__(
+        self,
+        delay_s: float = 0.0,
+        *,
+        mode: Mode = Mode.ASYNC,
+        decoding: Decoding = Decoding.CONSTRAINED,
+        late_anchor: bool = True,
+        give_way: object = None,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
         self.language = FakeLanguage()
         self.policy = FakePolicy()
         self.ring = TokenRing(256)
@@ -137,22 +153,24 @@ class Bench:
         self.budget = ReasoningBudget()
         self.said: list[str] = []
         self.records: list[dict[str, object]] = []
+        recorder = SimpleNamespace(put=lambda topic, stamp, record: self.records.append(record))
         self.loop = ReasoningLoop(
-            language=self.language,  # type: ignore[arg-type]
-            policy=self.policy,  # type: ignore[arg-type]
-            ring=self.ring,
-            slot=self.slot,
-            instruction="go",
-            frame_offsets_s=(0.0, 3.0),
-            max_new_tokens=4,
-            release_delay_s=lambda: delay_s,
-            recorder=SimpleNamespace(put=lambda topic, stamp, record: self.records.append(record)),  # type: ignore[arg-type]
+            GenerationModels(self.language, self.policy),  # type: ignore[arg-type]
+            SharedState(self.ring, self.slot),
+            ReasoningConfig((0.0, 3.0), 4, mode, decoding),
+            "go",
             stop=self.stop,
-            budget=lambda: self.budget,
-            role=Role("reasoning"),
-            say=self.said.append,
-            **more,  # type: ignore[arg-type]
+            schedule=ReasoningSchedule(
+                release_delay_s=lambda: delay_s,
+                budget=lambda: self.budget,
+                give_way=give_way,  # type: ignore[arg-type]
+                role=Role("reasoning"),
+                late_anchor=late_anchor,
+            ),
+            outputs=ReasoningOutputs(recorder, self.said.append),  # type: ignore[arg-type]
+            clock=clock,
         )
+        self.cycle = self.loop.cycle
         self.thread = threading.Thread(target=self.loop.run)
 
     def __enter__(self) -> Bench:

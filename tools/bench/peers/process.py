@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
+
+from sim_hil.processes.child_process import ChildProcess, parse_message
 
 ROOT = Path(__file__).parents[3]
 """The folder that holds the packages `tools` and `export`, which workers import by name."""
 
 END_S = 10.0
+"""Time that a worker has to end after it was asked to, s."""
+ANSWER_S = 3600.0
+"""Time that a worker has for one answer, s: loading and a round of calls of the slowest model."""
 SAMPLE_S = 0.02
 
 
@@ -37,70 +40,45 @@ class Worker:
     command: Sequence[str]
     cores: frozenset[int]
     log: Path
-    _process: subprocess.Popen[str] = field(init=False)
-    _stream: IO[bytes] = field(init=False)
+    _process: ChildProcess = field(init=False)
 
     def __enter__(self) -> Worker:
         threads = str(len(self.cores))
-        env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": threads, "MKL_NUM_THREADS": threads}
-        self._stream = self.log.open("wb")
+        env = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": threads, "MKL_NUM_THREADS": threads}
         before = os.sched_getaffinity(0)
         # A child inherits the affinity; its libraries count the cores when they are loaded.
         os.sched_setaffinity(0, self.cores)
         try:
-            self._process = subprocess.Popen(
-                list(self.command),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=self._stream,
-                text=True,
-                env=env,
-                start_new_session=True,
-            )
+            self._process = ChildProcess(self.command, log=self.log, env=env, new_session=True)
         except OSError as error:
-            self._stream.close()
             raise WorkerError(f"{self.name}: cannot start {self.command[0]} ({error.strerror})") from error
         finally:
             os.sched_setaffinity(0, before)
         return self
 
     def __exit__(self, *_: object) -> None:
-        try:
-            self._send({"end": True})
-            self._process.wait(END_S)
-        except (WorkerError, subprocess.TimeoutExpired):
-            self._process.kill()
-            self._process.wait()
-        for stream in (self._process.stdin, self._process.stdout, self._stream):
-            if stream is not None:
-                with suppress(BrokenPipeError):  # what a dead worker was never told
-                    stream.close()
+        self._process.send(json.dumps({"end": True}).encode())
+        self._process.close(END_S)
 
     @property
     def pid(self) -> int:
         """Process id."""
         return self._process.pid
 
-    def _send(self, message: Mapping[str, object]) -> None:
-        assert self._process.stdin is not None
-        try:
-            self._process.stdin.write(json.dumps(message) + "\n")
-            self._process.stdin.flush()
-        except (OSError, ValueError) as error:
-            raise WorkerError(f"{self.name}: the worker is gone; its log: {self.log}") from error
-
     def ask(self, message: Mapping[str, object]) -> dict[str, Any]:
         """Send a message and wait for its answer; raises WorkerError."""
-        self._send(message)
-        assert self._process.stdout is not None
-        line = self._process.stdout.readline()
-        if not line:
-            code = self._process.wait()
-            raise WorkerError(f"{self.name}: the worker ended with code {code}; its log: {self.log}")
+        if not self._process.send(json.dumps(message).encode()):
+            raise WorkerError(f"{self.name}: the worker is gone; its log: {self.log}")
         try:
-            answer: dict[str, Any] = json.loads(line)
-        except ValueError as error:
-            raise WorkerError(f"{self.name}: not an answer: {line[:80]!r}") from error
+            line = self._process.read_one(ANSWER_S)
+        except TimeoutError as error:
+            raise WorkerError(f"{self.name}: {error}; its log: {self.log}") from error
+        if line is None:
+            code = self._process.wait(END_S)
+            raise WorkerError(f"{self.name}: the worker ended with code {code}; its log: {self.log}")
+        answer = parse_message(line)
+        if answer is None:
+            raise WorkerError(f"{self.name}: expected a JSON object as answer, found {line[:80]!r}")
         if not answer.pop("ok", False):
             raise WorkerError(f"{self.name}: {answer.get('error', 'refused without a reason')}; its log: {self.log}")
         return answer

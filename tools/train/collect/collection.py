@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from sim_hil.benchmark.workers.worker_pool import Told, Workers
+from sim_hil.benchmark.workers.worker_pool import WorkerEvent, WorkerJob, Workers
 from tools.train.collect.dagger_driver import PolicyOptions
 from tools.train.collect.worker import MODULE, Order
 from tools.train.config.collect import CollectConfig, TourConfig
@@ -22,7 +22,6 @@ from tools.train.run.job import StageFailedError
 from tools.train.scenes.scenarios import KEPT_SEEDS, MAX_SEED
 
 WORKER: Final[Sequence[str]] = (sys.executable, "-m", MODULE)
-_POLL_S: Final = 0.5
 _TAG: Final = 0xC0
 _MOST_DROPPED: Final = 0.5
 """Share of unusable drives above which the recording fails: the cause lies outside single drives."""
@@ -78,23 +77,14 @@ def fill(
     stopped: Callable[[], bool] = lambda: False,
     command: Sequence[str] = WORKER,
 ) -> None:
-    """Record the drives that the data set lacks. Raises CollectFailedError, OSError, KeyboardInterrupt if `stopped`."""
-    waiting = deque(collection.orders(writer.folder, writer.has))
-    under_way: dict[str, tuple[Order, str]] = {}  # by key, and the drive that it has begun
-    logs = writer.folder / "logs"
-    logs.mkdir(exist_ok=True)
-    workers = Workers(command, jobs)
-    try:
-        while waiting or under_way:
-            if stopped():
-                raise KeyboardInterrupt
-            while waiting and workers.free():
-                order = waiting.popleft()
-                key = order.id(order.start)
-                under_way[key] = (order, "")
-                workers.start(key, order.as_json(), logs / f"{key}.log")
-            for told in workers.wait(_POLL_S):
-                _take(told, writer, under_way, waiting)
+    """Record what the data set lacks. Raises CollectFailedError, OSError, and KeyboardInterrupt when `stopped`."""
+    under_way = _UnderWay(writer)
+    for order in collection.orders(writer.folder, writer.has):
+        under_way.add(order)
+    with Workers(command, jobs) as workers:
+        for events in workers.run(under_way.waiting, stopped):
+            for event in events:
+                under_way.take(event)
             done, dropped = len(writer.entries(collection.prefix)), len(writer.dropped(collection.prefix))
             update(done + dropped, collection.count)
             if dropped > max(16, _MOST_DROPPED * (done + dropped)):
@@ -102,38 +92,51 @@ def fill(
                 raise CollectFailedError(
                     f"{dropped} of {done + dropped} drives gave nothing to learn, the last: {last}"
                 )
-    finally:
-        workers.close()
 
 
-def _take(told: Told, writer: DatasetWriter, under_way: dict[str, tuple[Order, str]], waiting: deque[Order]) -> None:
-    order, begun = under_way[told.key]
-    message = told.message
-    if message is None:
-        del under_way[told.key]
-        if told.why:
-            _again(order, begun, told.why, writer, waiting)
-    elif "begun" in message:
-        under_way[told.key] = (order, str(message["begun"]))
-    elif "drive" in message:
-        writer.add(Entry(**message["drive"]))
-    elif "dropped" in message:
-        if message["dropped"] not in order.skip:
-            writer.drop(str(message["dropped"]), str(message["why"]))
-    else:
-        raise CollectFailedError(str(message.get("refused", f"a worker said {message}")))
+class _UnderWay:
+    """Orders that wait or run, and the drive that each has begun."""
 
+    def __init__(self, writer: DatasetWriter) -> None:
+        self._writer = writer
+        self._logs = writer.folder / "logs"
+        self._logs.mkdir(exist_ok=True)
+        self._orders: dict[str, tuple[Order, str]] = {}
+        self.waiting: deque[WorkerJob] = deque()
 
-def _again(order: Order, begun: str, why: str, writer: DatasetWriter, waiting: deque[Order]) -> None:
-    """A process has died: the drive that it had begun is given up, and the rest of its layout is tried again."""
-    if not begun:
-        raise CollectFailedError(f"the process of drive {order.id(order.start)} and those after it {why}")
-    if not writer.has(begun):
-        writer.drop(begun, f"its process {why.split(':')[0]}")
-    ids = [order.id(number) for number in range(order.start, order.start + order.count)]
-    skip = tuple(drive_id for drive_id in ids if drive_id in order.skip or writer.has(drive_id))
-    if len(skip) < len(ids):
-        waiting.append(replace(order, skip=skip))
+    def add(self, order: Order) -> None:
+        """Let an order wait for a process."""
+        key = order.id(order.start)
+        self._orders[key] = (order, "")
+        self.waiting.append(WorkerJob(key, order.as_json(), self._logs / f"{key}.log"))
+
+    def take(self, event: WorkerEvent) -> None:
+        """Add a finished drive to the data set, or repeat what a dead process has left. Raises CollectFailedError."""
+        order, begun = self._orders[event.key]
+        message = event.message
+        if message is None:
+            if event.failure:
+                self._repeat(order, begun, event.failure)
+        elif "begun" in message:
+            self._orders[event.key] = (order, str(message["begun"]))
+        elif "drive" in message:
+            self._writer.add(Entry(**message["drive"]))
+        elif "dropped" in message:
+            if message["dropped"] not in order.skip:
+                self._writer.drop(str(message["dropped"]), str(message["why"]))
+        else:
+            raise CollectFailedError(str(message.get("refused", f"a worker sent {message}")))
+
+    def _repeat(self, order: Order, begun: str, failure: str) -> None:
+        """A process has died: drop the drive that it had begun and order the rest of its layout again."""
+        if not begun:
+            raise CollectFailedError(f"the process of drive {order.id(order.start)} and those after it {failure}")
+        if not self._writer.has(begun):
+            self._writer.drop(begun, f"its process {failure.split(':')[0]}")
+        ids = [order.id(number) for number in range(order.start, order.start + order.count)]
+        skip = tuple(drive_id for drive_id in ids if drive_id in order.skip or self._writer.has(drive_id))
+        if len(skip) < len(ids):
+            self.add(replace(order, skip=skip))
 
 
 def job_count(asked: int) -> int:

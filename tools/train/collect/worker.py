@@ -22,7 +22,8 @@ from export.core.typed import build, plain
 from sim_hil.benchmark.env.observation import Observation
 from sim_hil.benchmark.env.world import EpisodeWorld
 from sim_hil.benchmark.policies.expert import ExpertPolicy
-from sim_hil.benchmark.workers.worker_process import Message, worker_main
+from sim_hil.benchmark.workers.worker_process import worker_main
+from sim_hil.processes.child_process import Message
 from sim_hil.scene.scene import SceneError
 from tools.train.collect.dagger_driver import PolicyDriver, PolicyOptions
 from tools.train.collect.detour import draw_detour

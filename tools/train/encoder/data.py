@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import sys
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -23,7 +23,7 @@ from safetensors import SafetensorError, safe_open
 from edge.core.cli import write_whole
 from export.core.typed import build, plain
 from sim_hil.benchmark.suite.episode import ROBOTS
-from sim_hil.benchmark.workers.worker_pool import Told, Workers
+from sim_hil.benchmark.workers.worker_pool import WorkerEvent, WorkerJob, Workers
 from tools.train.config.encoder import OUTDOORS_LEAST, FramesConfig
 from tools.train.config.scenes import CORRIDOR, OUTDOORS
 from tools.train.drives.drive import file_sha256
@@ -164,30 +164,25 @@ def fill(
     taken: dict[str, int] = {}
     progress.update(before, total)
     # The slowest first, so that no core idles at the end.
-    waiting = sorted(missing, key=lambda shard: (shard.people * shard.frames, shard.name))
-    workers = Workers([sys.executable, "-m", WORKER], jobs or len(os.sched_getaffinity(0)))
-    try:
-        while waiting or workers.running():
-            if should_stop():
-                raise KeyboardInterrupt
-            while waiting and workers.free():
-                shard = waiting.pop()
-                job = {"folder": str(folder), "shard": plain(shard)}
-                workers.start(shard.name, job, logs / f"{shard.name}.log")
-            for told in workers.wait(_POLL_S):
-                _note(told, taken)
+    missing.sort(key=lambda shard: (shard.people * shard.frames, shard.name), reverse=True)
+    waiting = deque(
+        WorkerJob(shard.name, {"folder": str(folder), "shard": plain(shard)}, logs / f"{shard.name}.log")
+        for shard in missing
+    )
+    with Workers([sys.executable, "-m", WORKER], jobs) as workers:
+        for events in workers.run(waiting, should_stop):
+            for event in events:
+                _note(event, taken)
             progress.update(before + sum(taken.values()), total)
-    finally:
-        workers.close()
     with suppress(OSError):  # logs of processes that failed stay
         logs.rmdir()
 
 
-def _note(told: Told, taken: dict[str, int]) -> None:
-    if told.message is not None:
-        taken[told.key] = int(told.message["frames"])
-    elif told.why:
-        raise FramesError(f"pictures of {told.key}: their process {told.why}; go on with --resume")
+def _note(event: WorkerEvent, taken: dict[str, int]) -> None:
+    if event.message is not None:
+        taken[event.key] = int(event.message["frames"])
+    elif event.failure:
+        raise FramesError(f"pictures of {event.key}: their process {event.failure}; go on with --resume")
 
 
 def frames_sha256(folder: Path, shards: Sequence[Shard]) -> str:

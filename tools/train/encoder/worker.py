@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from safetensors.numpy import save_file
 
 from sim_hil.benchmark.language.visibility import ASPECT
-from sim_hil.benchmark.workers.worker_process import Message, worker_main
+from sim_hil.benchmark.workers.worker_process import worker_main
 from sim_hil.crowd.people import UPDATE_HZ, People, appearances
 from sim_hil.layouts import LayoutError
+from sim_hil.processes.child_process import Message
 from sim_hil.scene.scene import Scene
 from sim_hil.simulation.camera import CameraWorld
 from tools.train.config.encoder import MOST_SCENES

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import os
 import sys
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Final
 
-from sim_hil.benchmark.workers.worker_pool import Workers
+from sim_hil.benchmark.workers.worker_pool import WorkerJob, Workers
 from tools.train.rl.rollout import Rollout, read
 from tools.train.rl.worker import MODULE, RolloutOrder
 from tools.train.run.job import StageFailedError
 
 COMMAND: Final[Sequence[str]] = (sys.executable, "-m", MODULE)
-_POLL_S: Final = 0.5
 
 
 class RolloutFailedError(StageFailedError):
@@ -55,21 +55,14 @@ def drive(
     folder = Path(order.out)
     folder.mkdir(parents=True, exist_ok=True)
     orders = split(order, per_job)
-    waiting = [part for part in orders if not Path(part.out).is_file()]
-    workers = Workers(command, jobs or len(os.sched_getaffinity(0)))
-    try:
-        while waiting or workers.running():
-            if stopped():
-                raise KeyboardInterrupt
-            while waiting and workers.free():
-                part = waiting.pop(0)
-                stem = Path(part.out).stem
-                workers.start(stem, part.to_json(), folder / f"{stem}.log")
-            for line in workers.wait(_POLL_S):
-                if line.message is not None:
-                    finished(bool(line.message["success"]))
-                elif line.why:
-                    raise RolloutFailedError(f"rollout {line.key}: {line.why}")
-    finally:
-        workers.close()
+    missing = [part for part in orders if not Path(part.out).is_file()]
+    waiting = deque(
+        WorkerJob(Path(part.out).stem, part.to_json(), Path(part.out).with_suffix(".log")) for part in missing
+    )
+    with Workers(command, jobs) as workers:
+        for event in chain.from_iterable(workers.run(waiting, stopped)):
+            if event.message is not None:
+                finished(bool(event.message["success"]))
+            elif event.failure:
+                raise RolloutFailedError(f"rollout {event.key}: {event.failure}")
     return read([Path(part.out) for part in orders])

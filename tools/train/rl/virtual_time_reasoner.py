@@ -1,7 +1,7 @@
 """Reasoning beside a policy that is being trained: the robot's generation cycle, memory and prompt in virtual time.
 
-Algorithm 2, lines 5 and 6: "run VLM inference asynchronously in the background; retrieve the delayed hidden state". The
-generations are run by `LockstepReasoner`, as in the benchmark.
+Algorithm 2, lines 5 and 6: "run VLM inference asynchronously in the background; retrieve the delayed hidden state".
+`VirtualTimeReasoner` runs the generations, as in the benchmark.
 """
 
 from __future__ import annotations
@@ -15,17 +15,19 @@ import numpy.typing as npt
 
 from edge.artifacts.manifest import Artifacts
 from edge.core.geometry import SE2
+from edge.inference.generation_task import GenerationModels
+from edge.inference.graph import Interrupt
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
+from edge.reasoning.generation_cycle import Mode, ReasoningConfig
 from edge.run.assembly import semantic_config
-from edge.run.reasoning_loop import Mode
 from edge.safety.monitors.semantic import SemanticMonitor
 from edge.state.frame import fit_frame
 from edge.state.ring import EncodedFrame, TokenRing
-from edge.state.semantic import Context, SemanticSlot, SemanticState
+from edge.state.semantic import Context, SemanticSlot, SemanticState, SharedState
 from sim_hil.benchmark.conditions.latency import Timing
 from sim_hil.benchmark.policies.artifacts_policy import CONTROL_PERIOD_NS, RING_S
-from sim_hil.benchmark.policies.lockstep_reasoner import LockstepReasoner
+from sim_hil.benchmark.policies.lockstep_reasoner import VirtualTimeReasoner
 
 START_NS = 1_000_000_000
 """Virtual time at an episode's start, ns; not zero, because stamps are never zero."""
@@ -36,7 +38,7 @@ class _NoContextPolicy:
 
     guided_by_waypoints = False
 
-    def semantic_context(self, last_layer_kv: npt.NDArray[np.float32]) -> Context:
+    def semantic_context(self, last_layer_kv: npt.NDArray[np.float32], interrupt: Interrupt | None = None) -> Context:
         """Return an empty context."""
         return {}
 
@@ -66,16 +68,12 @@ class RolloutReasoner:
         self._slot = SemanticSlot()
         self._ring = TokenRing(round(RING_S * 1e9) // CONTROL_PERIOD_NS, models.policy.tokens_shape)
         stand_in: Any = _NoContextPolicy()
-        self._reasoner = LockstepReasoner(
-            language=models.language,
-            policy=stand_in,
-            ring=self._ring,
-            slot=self._slot,
-            instruction=instruction,
-            frame_offsets_s=runtime.frame_offsets_s,
-            max_new_tokens=runtime.max_new_tokens,
-            draw=draw,
-            mode=Mode.ASYNC,
+        self._reasoner = VirtualTimeReasoner(
+            GenerationModels(models.language, stand_in),
+            SharedState(self._ring, self._slot),
+            ReasoningConfig(runtime.frame_offsets_s, runtime.max_new_tokens),
+            instruction,
+            draw,
         )
 
     def observe(self, time_s: float, image: npt.NDArray[np.uint8], T_odom_base: SE2) -> npt.NDArray[np.float32]:
@@ -99,23 +97,20 @@ class RolloutReasoner:
         return self._slot.state
 
     def metadata(self, time_s: float, T_odom_base: SE2) -> tuple[float, float, float, float]:
-        """Return (Δt s, Δx m, Δy m, Δθ rad) of that state now; zeros before the first (Algorithm 4, line 19).
-
-        As in the runner, Δt is clipped to the longest delay that the policy was trained for.
-        """
+        """(Δt s, Δx m, Δy m, Δθ rad) of that state now, as on the robot; zeros before the first."""
         state = self._slot.state
         if state is None:
             return (0.0, 0.0, 0.0, 0.0)
-        offset = state.motion_offset(T_odom_base)
-        delay_s = state.delay_s(START_NS + round(time_s * 1e9))
-        return (self._ages.given_delay_s(delay_s), *offset.as_tuple())
+        now_ns = START_NS + round(time_s * 1e9)
+        latency = state.latency_input(now_ns, T_odom_base, self._ages.trained_delay_s)
+        return (latency.delay_s, *latency.offset.as_tuple())
 
     def speed_scale(self, time_s: float) -> float:
-        """Return the share of the speed limits, 0 to 1, that the robot's monitor leaves at the semantic state's age."""
+        """Share of the speed limits, 0 to 1, that the robot's monitor leaves at the age of the semantic state."""
         found = self._monitor.step(self._slot.state, 0, START_NS + round(time_s * 1e9))
         return min((each.speed_scale or 0.0 for each in found), default=1.0)
 
     @property
     def failure(self) -> str | None:
         """Why reasoning has ended for this episode; None while it continues."""
-        return self._reasoner.failure
+        return self._reasoner.cycle.failure

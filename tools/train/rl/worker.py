@@ -31,7 +31,8 @@ from sim_hil.benchmark.conditions.latency import LatencyProfile, LatencySampler
 from sim_hil.benchmark.env.gym_env import DynaNavEnv
 from sim_hil.benchmark.env.world import EpisodeWorld
 from sim_hil.benchmark.policies.select import robot_config
-from sim_hil.benchmark.workers.worker_process import Message, worker_main
+from sim_hil.benchmark.workers.worker_process import worker_main
+from sim_hil.processes.child_process import Message
 from tools.train.config.scenes import TASKS_PER_SCENE
 from tools.train.imitate.point_goal_net import PointGoalNet
 from tools.train.rl import rollout

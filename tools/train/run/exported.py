@@ -12,11 +12,11 @@ from typing import Final
 from edge.artifacts.files import MANIFEST_NAME
 from edge.core.cli import EXIT_DONE, EXIT_INTERRUPTED, write_whole
 from export.model.config import PRESETS, TicVlaConfig
+from sim_hil.processes.child_process import last_lines
 from tools.train.drives.drive import file_sha256
 
 TARGET: Final = "cpu"
 COMMAND: Final[Sequence[str]] = (sys.executable, "-m", "export.cli")
-_TAIL_CHARS: Final = 500
 
 
 class ExportError(RuntimeError):
@@ -45,8 +45,8 @@ def export_artifacts(
     if code.returncode == EXIT_INTERRUPTED:
         raise KeyboardInterrupt
     if code.returncode != EXIT_DONE:
-        said = log.read_text(encoding="utf-8", errors="replace")[-_TAIL_CHARS:].strip().splitlines()
-        raise ExportError(f"{weights}: edge-export ended with {code.returncode}: {said[-1] if said else f'see {log}'}")
+        lines = last_lines(log) or [f"see {log}"]
+        raise ExportError(f"{weights}: edge-export ended with {code.returncode}: {lines[-1]}")
     write_whole(mark, json.dumps({"weights_sha256": digest}) + "\n")
     return out
 

@@ -1,4 +1,4 @@
-"""Greedy decoding of many prompts at once, with what each leaves: the runner's own loop, rows at a time."""
+"""Greedy decoding of many prompts at once, with the keys and values of each row; the same loop as the runner's."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Constraint: TypeAlias = LineConstraint | TextConstraint
 
 @dataclass(frozen=True)
 class DecodeResult:
-    """One row's answer."""
+    """Decoded tokens of one row, and its keys and values."""
 
     ids: tuple[int, ...]
     """New tokens, without the one that ends the text."""
@@ -32,9 +32,10 @@ class DecodeResult:
 def decode(
     language: LanguageModel, batch: LanguageBatch, max_new_tokens: int, constraints: Sequence[Constraint | None] = ()
 ) -> list[DecodeResult]:
-    """Decode an answer to each row of a batch of prompts, within the row's constraint.
+    """Decode each row of a batch of prompts greedily, within the row's constraint.
 
-    Each step feeds one token a row at that row's own position; a row that has ended feeds on, unread, until all have.
+    Each step feeds one token per row at that row's position. A row that has ended is fed until all have ended; its
+    further tokens are ignored.
     """
     c, lengths = language.config, batch.lengths
     rows, prompt = batch.input_ids.shape
@@ -42,7 +43,7 @@ def decode(
     room = min(max_new_tokens, c.max_context - min(fed))
     first = run(language, batch.input_ids, batch.visual_tokens, (lengths - 1)[:, None])
     assert first.hidden is not None
-    # What lies behind a row's prompt is padding; it is overwritten before anything may look at it.
+    # Behind a row's prompt is padding; it is overwritten before any position attends to it.
     caches = [(F.pad(k, (0, 0, 0, room)), F.pad(v, (0, 0, 0, room))) for k, v in first.caches]
     token = language.lm_head(first.hidden[:, 0]).argmax(-1)
     places = torch.arange(prompt + room, device=token.device)
@@ -50,12 +51,12 @@ def decode(
     ids: list[list[int]] = [[] for _ in range(rows)]
     open_rows = [max_new_tokens > 0] * rows
     for step in range(room):
-        taken = [
+        ids_now = [
             chosen if constraint is None else constraint.choose(chosen)
             for chosen, constraint in zip(token.tolist(), constraints or [None] * rows, strict=True)
         ]
-        token = torch.tensor(taken, device=token.device)
-        for i, chosen in enumerate(taken):
+        token = torch.tensor(ids_now, device=token.device)
+        for i, chosen in enumerate(ids_now):
             if chosen == c.im_end_id or fed[i] + step >= c.max_context:
                 open_rows[i] = False
             elif open_rows[i]:

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
 from edge.core.geometry import SE2
-from edge.run.reasoning_loop import Mode
+from edge.inference.generation_task import GenerationModels
+from edge.reasoning.generation_cycle import Mode, ReasoningConfig
 from edge.state.ring import EncodedFrame, TokenRing
-from edge.state.semantic import SemanticSlot
+from edge.state.semantic import SemanticSlot, SharedState
 from sim_hil.benchmark.conditions.latency import Timing
-from sim_hil.benchmark.policies.lockstep_reasoner import LockstepReasoner
+from sim_hil.benchmark.policies.lockstep_reasoner import VirtualTimeReasoner
 from tests.support.runner.reasoning_bench import KV, FakeLanguage, FakePolicy
 
 TICK_NS = 100_000_000
-
-
-class Policy(FakePolicy):
-    def semantic_context(self, last_layer_kv: np.ndarray, interrupt: object = None) -> dict[str, np.ndarray]:
-        return {"context.0.key": last_layer_kv}
 
 
 class Bench:
@@ -36,22 +31,15 @@ class Bench:
         coasting: tuple[float, ...] = (),
     ) -> None:
         self.x_m, self.coasting, self.left = 0.0, coasting, ()
-        self.language, self.policy = FakeLanguage(), Policy()
-        self.language.begin = lambda cancelled: type(self.language).begin(  # type: ignore[method-assign]
-            self.language, cancelled, interrupt=None, before_call=lambda _: None
-        )
+        self.language, self.policy = FakeLanguage(), FakePolicy()
         self.ring, self.slot, self.tick = TokenRing(160), SemanticSlot(), 0
         timing = Timing(round(latency_s * 1e9), round(anchor_after_s * 1e9))
-        self.reasoner = LockstepReasoner(
-            language=self.language,  # type: ignore[arg-type]
-            policy=self.policy,  # type: ignore[arg-type]
-            ring=self.ring,
-            slot=self.slot,
-            instruction="go",
-            frame_offsets_s=(0.0, 3.0),
-            max_new_tokens=4,
-            draw=lambda: timing,
-            mode=mode,
+        self.reasoner = VirtualTimeReasoner(
+            GenerationModels(self.language, self.policy),  # type: ignore[arg-type]
+            SharedState(self.ring, self.slot),
+            ReasoningConfig((0.0, 3.0), 4, mode),
+            "go",
+            lambda: timing,
         )
         self.seen: list[tuple[float, int | None, float | None]] = []
 
@@ -102,17 +90,6 @@ def test_availability_is_at_the_first_tick_that_is_not_before_it(latency_s: floa
     assert next(time_s for time_s, generation, _ in bench.seen if generation == 0) == there_s
 
 
-def test_the_frames_are_those_that_there_are_at_the_offsets() -> None:
-    bench = Bench(2.0)
-    bench.run(8.1)
-    assert [[stamp - 1 for stamp in stamps] for stamps in bench.language.prompts] == [
-        pytest.approx([0.0]),
-        pytest.approx([2.0]),
-        pytest.approx([1.0, 4.0]),
-        pytest.approx([3.0, 6.0]),
-    ]
-
-
 def test_the_anchor_is_where_and_when_the_newest_frame_was_captured() -> None:
     bench = Bench(2.0)
     bench.run(4.0)
@@ -127,21 +104,6 @@ def test_a_late_newest_frame_shortens_the_delay_and_not_the_generation() -> None
     bench.run(6.0)
     assert next(row for row in bench.seen if row[1] == 0) == (3.0, 0, 2.0)
     assert next(row for row in bench.seen if row[1] == 1) == (6.0, 1, 2.0)
-
-
-def test_without_reasoning_nothing_is_decoded() -> None:
-    bench = Bench(0.2, mode=Mode.NO_REASONING)
-    bench.run(1.0)
-    assert set(bench.language.caps) == {0} and not bench.slot.state.text_complete  # type: ignore[union-attr]
-
-
-def test_sync_drives_half_a_second_after_each_answer_and_then_thinks_anew() -> None:
-    bench = Bench(2.0, mode=Mode.SYNC)
-    bench.run(5.1)
-    starts = [record["started_s"] - 1 for record in bench.reasoner.released]
-    # The halt takes effect in the tick at 2.5 s, whose frame it has driven up to.
-    assert starts == pytest.approx([0.0, 2.6])
-    assert bench.slot.drive_until_ns == round((1 + 4.6 + 0.5) * 1e9)
 
 
 def test_sync_anchors_where_the_robot_has_come_to_stand() -> None:
@@ -160,10 +122,6 @@ def test_sync_does_not_wait_for_ever_for_odometry_to_rest() -> None:
     assert bench.reasoner.released[1]["anchor_s"] - 1 == pytest.approx(2.5 + 1.0)
 
 
-def test_sync_may_not_drive_before_the_first_answer() -> None:
-    assert Bench(2.0, mode=Mode.SYNC).slot.drive_until_ns == 0
-
-
 def test_a_policy_guided_by_waypoints_is_not_given_a_text_without_any() -> None:
     bench = Bench(1.0)
     bench.policy.guided_by_waypoints = True
@@ -172,18 +130,4 @@ def test_a_policy_guided_by_waypoints_is_not_given_a_text_without_any() -> None:
     bench.run(5.0)
     assert bench.slot.state is not None and bench.slot.state.generation == 0
     assert [record["used"] for record in bench.reasoner.released] == [True, False, False, False, False]
-    assert bench.reasoner.invalid_in_a_row == 4
-
-
-def test_a_failed_generation_is_counted_and_tried_again_after_a_rest() -> None:
-    bench = Bench(1.0)
-    bench.language.broken = 1
-    bench.run(2.5)
-    assert bench.reasoner.failed == 1 and bench.reasoner.released[0]["started_s"] - 1 == pytest.approx(1.5)
-
-
-def test_five_failures_within_a_minute_end_reasoning_as_on_board() -> None:
-    bench = Bench(1.0)
-    bench.language.broken = 100
-    bench.run(20.0)
-    assert bench.reasoner.failed == 5 and "5 generations failed" in (bench.reasoner.failure or "")
+    assert bench.reasoner.cycle.invalid_in_a_row == 4

@@ -9,17 +9,18 @@ import numpy as np
 import pytest
 from tokenizers import Tokenizer
 
+from edge.inference.generation_task import GenerationModels
 from edge.inference.language import Generation
 from edge.reasoning.decoding_rules import DecodingContext, TextConstraint
+from edge.reasoning.generation_cycle import ReasoningConfig
 from edge.reasoning.prompt import PromptBuilder, PromptIds, Segment
-from edge.run.reasoning_loop import Mode
 from edge.state.reasoning_text import Progress, format_text, parse_progress, parse_waypoints
 from edge.state.ring import EncodedFrame, TokenRing
-from edge.state.semantic import SemanticSlot
+from edge.state.semantic import SemanticSlot, SharedState
 from export.model.config import PRESETS
 from export.model.tokenizers.nano import NANO_TOKENIZER
 from sim_hil.benchmark.conditions.latency import Timing
-from sim_hil.benchmark.policies.lockstep_reasoner import LockstepReasoner
+from sim_hil.benchmark.policies.lockstep_reasoner import VirtualTimeReasoner
 from tests.support.train.train_drives import WORDINGS, made_up_drive, progress_at, trace_at
 from tools.train.config.sft import DrawConfig
 from tools.train.samples.anchors import (
@@ -85,7 +86,7 @@ class Listener:
 class NoPolicy:
     guided_by_waypoints = False
 
-    def semantic_context(self, last_layer_kv: np.ndarray) -> dict[str, np.ndarray]:
+    def semantic_context(self, last_layer_kv: np.ndarray, interrupt: object = None) -> dict[str, np.ndarray]:
         return {}
 
 
@@ -96,23 +97,19 @@ def test_prompts_are_those_that_the_runner_builds_along_the_drive(
     drive, language, ring = made_up_drive("a"), Listener(), TokenRing(160)
     asked = list(range(0, 130, 10 * seconds))
     language.says = [format_text(anchors[k].reasoning) for k in asked]
-    reasoner = LockstepReasoner(
-        language=language,  # type: ignore[arg-type]
-        policy=NoPolicy(),  # type: ignore[arg-type]
-        ring=ring,
-        slot=SemanticSlot(),
-        instruction=WORDINGS[0],
-        frame_offsets_s=(0.0, 3.0, 6.0, 9.0),
-        max_new_tokens=8,
-        draw=lambda: Timing(seconds * 10 * PERIOD_NS, 0),
-        mode=Mode.ASYNC,
+    reasoner = VirtualTimeReasoner(
+        GenerationModels(language, NoPolicy()),  # type: ignore[arg-type]
+        SharedState(ring, SemanticSlot()),
+        ReasoningConfig((0.0, 3.0, 6.0, 9.0), 8),
+        WORDINGS[0],
+        lambda: Timing(seconds * 10 * PERIOD_NS, 0),
     )
     for k in range(130):
         now_ns = START_NS + k * PERIOD_NS
         reasoner.release(now_ns)
         ring.put(EncodedFrame(now_ns, drive.T_odom_base(k), np.zeros((1, 1, 1), np.float32)))
         reasoner.start(now_ns)
-    assert reasoner.failed == 0 and len(language.heard) >= 4
+    assert reasoner.cycle.failed == 0 and len(language.heard) >= 4
     for k, heard in zip(asked, language.heard, strict=False):
         drawn = Drawn(WORDINGS[0], anchors[k].before(float(seconds)))
         assert prompts.prompt(anchors[k], drawn) == heard

@@ -1,0 +1,1 @@
+"""Child processes that report to their parent in lines of JSON."""
