@@ -120,14 +120,14 @@ def measure(
     """
     # Here: they load every robot's protocol, which no other job of `edge-calib` needs.
     from edge.run.assembly import HISTORY_MARGIN_S
-    from edge.runner import SWITCH_INTERVAL_S
+    from edge.run.command import SWITCH_INTERVAL_S
 
     runtime = artifacts.runtime
     schedule = schedule_for(artifacts)
     activity = TickActivity(runtime.tick_period_ms * 1_000_000)
     policy = Policy(artifacts, schedule=schedule, activity=activity)
     language = LanguageModel(artifacts, schedule=schedule)
-    language.check_instruction(instruction, len(runtime.frame_offsets_s))
+    language.check_instruction(instruction)
     try:
         warm_up(policy, language, runtime.image_px, len(runtime.frame_offsets_s))
     except (GraphError, ContextOverflowError) as error:

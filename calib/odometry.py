@@ -33,9 +33,9 @@ from edge.core.geometry import SE2, interpolate, wrap_angle
 from edge.flightlog.reader import RecordingError, jpeg_bytes, read_messages
 from edge.odometry.calibration import CalibrationError, OdometryCalibration
 from edge.odometry.camera_geometry import Attitude, CameraGeometry
-from edge.odometry.dead_reckoning import Interval, OdometryModel, integrate, split
 from edge.odometry.drift_rate import Comparison, DriftMonitor
 from edge.odometry.gate import Increment, OdometryGate, OdometryInputs
+from edge.odometry.pose_chain import Interval, OdometryModel, integrate, split
 from edge.odometry.visual_odometry import VisualMotion, VisualOdometry, grey_frame
 from firmware_bridge.core.config import ConfigError, load_robot_config
 

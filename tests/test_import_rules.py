@@ -108,13 +108,15 @@ def test_the_bridge_knows_neither_the_runner_nor_any_machine_learning(path: Path
     assert not {name.split(".")[0] for name in imports(path)} & {"edge", "numpy", "onnxruntime", "cv2", "tokenizers"}
 
 
-@pytest.mark.parametrize("module", ["edge.runner", "firmware_bridge", "firmware_bridge.bridge"])
+@pytest.mark.parametrize("module", ["edge.run.command", "firmware_bridge", "firmware_bridge.bridge"])
 def test_importing_it_pulls_in_neither_torch_nor_pybullet(module: str) -> None:
     code = f"import {module}, sys; sys.exit(bool({{'torch', 'pybullet'}} & set(sys.modules)))"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
-@pytest.mark.parametrize("module", ["edge.runner", "export.evaluation.gate_run", "calib.power", "tools.bench.tick"])
+@pytest.mark.parametrize(
+    "module", ["edge.run.command", "export.evaluation.gate_run", "calib.power", "tools.bench.tick"]
+)
 def test_onnx_runtime_is_told_to_keep_no_telemetry_before_it_is_imported(module: str) -> None:
     code = (
         f"import os, sys; os.environ.pop('ORT_DISABLE_TELEMETRY', None); import {module}; names = list(sys.modules); "

@@ -9,11 +9,12 @@ from typing import Any
 
 import pytest
 
-from edge import runner
 from edge.core.cli import EXIT_CHECK_FAILED
 from edge.core.stats import Samples
 from edge.flightlog.replay.command import Tolerance, verdict
 from edge.flightlog.replay.policy import Comparison
+from edge.reasoning.generation_cycle import GenerationCycle, ReasoningConfig
+from edge.run import command as runner
 from edge.run.control_loop import ControlStatistics
 from edge.run.result import run_result
 from edge.state.switches import Switches
@@ -84,9 +85,10 @@ def test_a_run_without_a_finite_plan_is_a_fault_with_exit_code_1(
         supervision=SimpleNamespace(state=SimpleNamespace(value="zero")),
     )
     reasoning = SimpleNamespace(
-        generations=1, failed=0, cancelled=0, missed_frames=0, invalid_texts=0, gave_way_ns=0,
-        generation_ms=Samples(), anchor_to_ready_ms=Samples(), late_anchor_ms=Samples(),
-    )  # fmt: skip
+        cycle=GenerationCycle(ReasoningConfig((), 0)),
+        times=SimpleNamespace(generation_ms=Samples(), anchor_to_ready_ms=Samples(), late_anchor_ms=Samples()),
+        gave_way_ns=0,
+    )
     inputs = SimpleNamespace(
         camera=SimpleNamespace(frames=1, failures=0), odometry=None, states=1,
         estimator=SimpleNamespace(rejected={}, visual_used=0, visual_rejected=0),

@@ -1,4 +1,4 @@
-"""What an ONNX file says about weights outside itself, read from its bytes before any library opens it.
+"""References of an ONNX file to weights outside itself, read from its bytes before any library opens it.
 
 ONNX and ONNX Runtime have each been patched several times for external data that leaves the model's folder (`..`,
 symlinks, hard links, unknown keys: faults page, "Model artifacts"). So none of theirs is asked: this walks the protobuf
@@ -18,15 +18,10 @@ FIELDS: Mapping[str, Mapping[int, str]] = {
     "FunctionProto": {7: "NodeProto", 11: "AttributeProto"},
     "NodeProto": {5: "AttributeProto"},
     "AttributeProto": {
-        5: TENSOR,
-        6: "GraphProto",
-        10: TENSOR,
-        11: "GraphProto",
-        22: "SparseTensorProto",
-        23: "SparseTensorProto",
+        5: TENSOR, 6: "GraphProto", 10: TENSOR, 11: "GraphProto", 22: "SparseTensorProto", 23: "SparseTensorProto",
     },
     "SparseTensorProto": {1: TENSOR, 2: TENSOR},
-}
+}  # fmt: skip
 """Field numbers of onnx.proto that lead to a tensor, by message; a test compares them with onnx's own description."""
 
 _EXTERNAL_DATA = 13  # of TensorProto: repeated {1: key, 2: value}

@@ -38,7 +38,7 @@ class ArtifactError(ValueError):
 
 @dataclass(frozen=True)
 class FileIdentity:
-    """What tells whether a file is still the one that was hashed.
+    """Identity of a file: whether it is still the one that was hashed.
 
     Anybody who may write a file can set its time of modification. The kernel alone sets its time of change: a write, a
     rename and that setting itself all advance it.
@@ -57,7 +57,7 @@ class FileIdentity:
 
     @classmethod
     def from_stat(cls, found: os.stat_result) -> FileIdentity:
-        """Identity of a file that has been looked at."""
+        """Identity of a file by its status."""
         return cls(found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns)
 
 

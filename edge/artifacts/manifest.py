@@ -20,7 +20,7 @@ from edge.artifacts.files import (
     read_file,
     read_manifest_bytes,
 )
-from edge.artifacts.provider_options import wrong_option
+from edge.artifacts.providers import wrong_option
 from edge.artifacts.trust import Trust
 from edge.state.reasoning_text import WAYPOINT_TIMES_S
 from edge.state.switches import Decoding, RecoverySwitch
@@ -28,19 +28,10 @@ from firmware_bridge.core.config import BRIDGE_PRIORITY
 
 LANGUAGE_WHOLE = ("language_model",)
 LANGUAGE_PAIR = ("language_model.prefill", "language_model.decode")
-_POSITIVE = frozenset(
-    {
-        "image_px",
-        "frame_tokens",
-        "kv_dim",
-        "max_context",
-        "max_new_tokens",
-        "prefill_chunk_tokens",
-        "tick_period_ms",
-        "step_s",
-    }
-)
-
+_POSITIVE = frozenset((
+    "image_px", "frame_tokens", "kv_dim", "max_context", "max_new_tokens", "prefill_chunk_tokens", "tick_period_ms",
+    "step_s",
+))  # fmt: skip
 _SWITCHES: Mapping[str, type[Decoding | RecoverySwitch]] = {"decoding": Decoding, "recovery": RecoverySwitch}
 _LISTS = ("frame_offsets_s", "control_cores", "reasoning_cores")
 

@@ -1,4 +1,4 @@
-"""What a manifest says of the device it was made for: the target's own figures and the plan, read with care."""
+"""The device that a manifest was made for: the target's figures and the plan, checked as they are read."""
 
 from __future__ import annotations
 

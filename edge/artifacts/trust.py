@@ -1,7 +1,7 @@
 """Trust in signed artifacts: `manifest.sig`, an Ed25519 signature of the manifest and a release counter.
 
 The manifest holds the SHA-256 of every other file, so a signature of its bytes is one of the whole directory. It is
-optional: without a trusted key the hashes still find damage, but not somebody who can rewrite the manifest as well.
+optional: without a trusted key the hashes still find damage, but not an attacker who can rewrite the manifest as well.
 With one (`edge-run --trust KEY.pub`), artifacts that are unsigned, signed by another key, or of an older release than
 the last accepted one are refused before the manifest is parsed (fault matrix row 55). `edge.signature` makes keys and
 signs.
@@ -69,7 +69,7 @@ def key_id_of(library: Ed25519, key: Any) -> str:
 class Trust:
     """A public key on the robot, and the file that remembers the last release accepted under it.
 
-    Raises KeyFileError when the key cannot be read: a robot told to trust a key never goes on without it.
+    Raises KeyFileError when the key cannot be read: a robot configured to trust a key never goes on without it.
     """
 
     def __init__(self, key_file: Path, counter_file: Path) -> None:

@@ -172,7 +172,7 @@ def _give_up_stdout() -> None:
 
 
 def run_with_extra(command: str, module: str, extra: str) -> int:
-    """Run `module.main()` of an optional part; without its packages, one line that says how to install them."""
+    """Run `module.main()` of an optional part; without its packages, write one line: how to install them."""
     try:
         main = importlib.import_module(module).main
     except ModuleNotFoundError as error:

@@ -1,4 +1,4 @@
-"""One deadline for everything that has to end, so that the sum of all waits is bounded."""
+"""Waits for what may hang, under one deadline for everything that has to end."""
 
 from __future__ import annotations
 
@@ -21,17 +21,23 @@ class Deadline:
 
     def run(self, name: str, body: Callable[[], object]) -> bool:
         """Run what may hang, for as long as is left; whether it ended in time. Raises what `body` raises."""
-        errors: list[BaseException] = []
+        return run_in_thread(name, body, self.left_s())
 
-        def target() -> None:
-            try:
-                body()
-            except BaseException as error:  # noqa: BLE001 - raised again in the caller's thread
-                errors.append(error)
 
-        thread = threading.Thread(target=target, name=name, daemon=True)
-        thread.start()
-        thread.join(self.left_s())
-        if errors:
-            raise errors[0]
-        return not thread.is_alive()
+def run_in_thread(name: str, body: Callable[[], object], timeout_s: float | None = None) -> bool:
+    """Run `body` in a thread and wait for it; whether it has ended. Raises what `body` raises."""
+    errors: list[BaseException] = []
+
+    def target() -> None:
+        try:
+            body()
+        except BaseException as error:  # noqa: BLE001 - raised again in the caller's thread
+            errors.append(error)
+
+    # A daemon where it may outlast its time: a thread that hangs must not keep the process from ending.
+    thread = threading.Thread(target=target, name=name, daemon=timeout_s is not None)
+    thread.start()
+    thread.join(timeout_s)
+    if errors:
+        raise errors[0]
+    return not thread.is_alive()

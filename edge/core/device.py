@@ -1,11 +1,11 @@
-"""What the program runs on, read from the files in which Linux and Jetson say so; the root can be another folder."""
+"""The device that the program runs on, read from the files of Linux and Jetson; the root can be another folder."""
 
 from __future__ import annotations
 
 import importlib.metadata
 import platform
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -120,25 +120,19 @@ def _provider_version(provider: str, root: Path, version_of: Callable[[str], str
         return None
     libraries = [path.name for folder in _LIBRARY_FOLDERS for path in (root / folder).glob(pattern)]
     versions = [name.partition(".so.")[2] for name in libraries]
-    # libnvinfer.so.10 is a link to libnvinfer.so.10.3.0: the longest says most.
+    # libnvinfer.so.10 is a link to libnvinfer.so.10.3.0: the longest name has the whole version.
     return max(versions, key=len, default=None)
 
 
-def power_modes(conf: str) -> Mapping[str, int]:
-    """Power modes by name from the text of an `nvpmodel` configuration."""
-    found = re.findall(r"<\s*POWER_MODEL\s+ID=(\d+)\s+NAME=(\S+)\s*>", conf)
-    return {name: int(number) for number, name in found}
-
-
-def current_power_mode(query: str) -> str | None:
-    """Name of the mode that `nvpmodel -q` reports; None if its text names none."""
-    found = re.search(r"^\s*NV Power Mode:\s*(\S+)\s*$", query, re.MULTILINE)
-    return found[1] if found else None
-
-
 def check_power_mode(wanted: str, *, conf: str, query: str) -> None:
-    """Raise DeviceError unless the board has a mode of that name and is in it; ids differ between modules."""
-    modes, current = power_modes(conf), current_power_mode(query)
+    """Raise DeviceError unless the board has a mode of that name and is in it; ids differ between modules.
+
+    `conf`: text of an `nvpmodel` configuration; `query`: what `nvpmodel -q` prints.
+    """
+    found = re.findall(r"<\s*POWER_MODEL\s+ID=(\d+)\s+NAME=(\S+)\s*>", conf)
+    modes = {name: number for number, name in found}
+    answer = re.search(r"^\s*NV Power Mode:\s*(\S+)\s*$", query, re.MULTILINE)
+    current = answer[1] if answer else None
     if wanted not in modes:
         raise DeviceError(
             f"power mode {wanted!r} is not on this board; it has {', '.join(modes) or 'none'}: export for one of these "

@@ -29,7 +29,7 @@ def jpeg_size(jpeg: bytes) -> tuple[int, int] | None:
 
 
 def jpeg_refusal(jpeg: bytes) -> str | None:
-    """Why these bytes must not be given to a decoder, in a few words; None when they may."""
+    """Why these bytes must not be given to a decoder, for a message; None when they may."""
     if len(jpeg) > MAX_BYTES:
         return f"{len(jpeg)} bytes, at most {MAX_BYTES}"
     size = jpeg_size(jpeg)

@@ -1,4 +1,4 @@
-"""Small files in which Linux says numbers and names; the root can be another folder."""
+"""Numbers and names in small files of Linux; the root can be another folder."""
 
 from __future__ import annotations
 

@@ -16,9 +16,9 @@ from typing import Any, Final
 
 import psutil
 
-from edge.artifacts.device_nodes import device_nodes
 from edge.artifacts.files import ArtifactError, read_manifest, read_manifest_bytes
 from edge.artifacts.manifest import Artifacts, load_artifacts
+from edge.artifacts.providers import device_nodes
 from edge.artifacts.target_facts import TargetFacts, target_facts
 from edge.artifacts.trust import STATE_DIRECTORY, Trust
 from edge.core.cli import EXIT_CHECK_FAILED, EXIT_DONE, write_result, write_whole

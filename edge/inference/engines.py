@@ -1,7 +1,7 @@
 """Engines of TensorRT and OpenVINO: built ahead of time on the device, checked before control starts.
 
 A provider that compiles would otherwise do so at the first run, for minutes and without a word. Here every graph that
-needs an engine gets one in a folder of its own; `engines.json` says what it depends on and the hash of each file.
+needs an engine gets one in a folder of its own; `engines.json` lists what it depends on and the hash of each file.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from edge.artifacts.files import HASH_BLOCK_BYTES, ArtifactError, FileIdentity, read_manifest
+from edge.artifacts.files import HASH_BLOCK_BYTES, FileIdentity, read_manifest
 from edge.artifacts.manifest import Artifacts, TensorContract
 from edge.core.cli import write_whole
 from edge.core.device import OPENVINO, TENSORRT, DeviceFacts, available_providers, read_device
@@ -80,7 +80,7 @@ class VerifiedEngines:
 
 
 def default_directory(artifacts: Path) -> Path:
-    """Where the engines of an artifact directory are unless told otherwise: beside it, as it is sealed."""
+    """Where the engines of an artifact directory are by default: beside it, as it is sealed."""
     return artifacts.with_name(artifacts.name + ".engines")
 
 
@@ -127,7 +127,7 @@ def key_of(inputs: Mapping[str, Any]) -> str:
 
 
 def check(artifacts: Artifacts, directory: Path, machine: Machine | None = None) -> VerifiedEngines:
-    """Verify every engine needed; returns what tells whether a file changes afterwards.
+    """Verify every engine needed; returns what detects a file that changes afterwards.
 
     Raises EngineError, naming the command that helps, unless every engine is there and this device's own.
     """
@@ -149,7 +149,7 @@ def check(artifacts: Artifacts, directory: Path, machine: Machine | None = None)
 
 
 def _wrong(artifacts: Artifacts, name: str, directory: Path, entry: Any, machine: Machine) -> str | None:
-    """What is wrong with an engine, in words; None if it is as it should be."""
+    """Return what is wrong with an engine, for a message; None if nothing is."""
     if not isinstance(entry, dict):
         return f"has no engine in {directory}"
     inputs = engine_inputs(artifacts, name, machine)
@@ -268,7 +268,7 @@ def _build_one(artifacts: Artifacts, name: str, directory: Path, machine: Machin
     identities = _identities(final)
     _open_and_run(artifacts, name, final, machine)
     after = _hashes(final)
-    # Compiling again may give the very same bytes: the file's identity tells.
+    # Compiling again may give the very same bytes: the file's identity changes all the same.
     rewritten = {file for file, found in _identities(final).items() if identities.get(file) != found}
     changed = sorted(rewritten | {file for file in {*built, *after} if built.get(file) != after.get(file)})
     if changed:
@@ -332,7 +332,7 @@ def _check_profiles(artifacts: Artifacts, names: Sequence[str]) -> None:
 
 @contextmanager
 def _busy(say: Progress, line: str) -> Iterator[None]:
-    """Say that something is still going on while it is: a compiler says nothing for minutes."""
+    """Report at intervals that a build goes on: a compiler prints nothing for minutes."""
     done = threading.Event()
     started_ns = time.monotonic_ns()
 
@@ -347,16 +347,3 @@ def _busy(say: Progress, line: str) -> Iterator[None]:
     finally:
         done.set()
         thread.join()
-
-
-__all__ = [
-    "ENGINES_NAME",
-    "ArtifactError",
-    "EngineError",
-    "Machine",
-    "build",
-    "check",
-    "default_directory",
-    "needed",
-    "with_engines",
-]

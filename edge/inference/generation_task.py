@@ -17,7 +17,7 @@ from edge.inference.policy import Policy
 from edge.reasoning.decoding_rules import DecodingContext, TextConstraint
 from edge.reasoning.instruction_state import Job
 from edge.reasoning.path_memory import Way
-from edge.reasoning.prompt import told_before
+from edge.reasoning.prompt import format_before
 from edge.state.reasoning_text import Waypoints, parse_waypoints
 from edge.state.ring import EncodedFrame, TokenRing
 from edge.state.semantic import Context, SemanticState
@@ -120,7 +120,7 @@ class GenerationTask:
         stop = self.job.memory.stop
         return {
             "way": self._way,
-            "before": told_before(self._context.before),
+            "before": format_before(self._context.before),
             **self._context.record(),
             "overruled": result.constraint.overruled,
             "planned": result.constraint.planned,

@@ -30,13 +30,13 @@ class GraphError(RuntimeError):
 
 
 class CancelledError(Exception):
-    """A generation was told to stop."""
+    """A generation was stopped on request."""
 
 
 class Interrupt:
     """Ends calls from another thread, also in the middle of one; it belongs to one generation and stays set.
 
-    ONNX Runtime looks at it between two nodes of a graph, so a compiled engine, which is one node, is finished first.
+    ONNX Runtime checks it between two nodes of a graph, so a compiled engine, which is one node, is finished first.
     """
 
     def __init__(self) -> None:
@@ -75,7 +75,7 @@ class Binding:
 
 
 class Graph:
-    """A session on the execution provider and with the threads that the manifest names, unless told otherwise.
+    """A session on the execution provider and with the threads that the manifest, or an argument, names.
 
     Opened from the bytes whose hash was checked, so a file that changes meanwhile cannot be run. Weights in data files
     are mapped, not read; the files' identity is checked again once the session holds them.
@@ -145,7 +145,7 @@ class Graph:
 
     @property
     def device(self) -> str:
-        """Where the graph's large buffers belong, in ONNX Runtime's words: `cpu` or `cuda`."""
+        """Where the graph's large buffers belong, by ONNX Runtime's name: `cpu` or `cuda`."""
         return _DEVICES.get(self.provider, "cpu")
 
     def run(

@@ -158,12 +158,13 @@ class LanguageModel:
         self._kv = np.zeros((1, runtime.max_context, runtime.kv_dim), dtype=np.float32)
         self._took_ns: dict[int, int] = {}
 
-    def check_instruction(self, instruction: str, frames: int) -> None:
-        """Raise InstructionError unless a prompt with `frames` frames and a full answer fit the model's context.
+    def check_instruction(self, instruction: str) -> None:
+        """Raise InstructionError unless a prompt with all frames and a full answer fit the model's context.
 
         The prompt is taken at its longest: with all points of a way that leads far off, and a long progress.
         """
-        filler = [EncodedFrame(i, SE2(0.0, 0.0, 0.0), self._no_frame) for i in range(frames)]
+        frames = range(len(self.runtime.frame_offsets_s))
+        filler = [EncodedFrame(i, SE2(0.0, 0.0, 0.0), self._no_frame) for i in frames]
         prompt = self.prompt.build(filler, instruction, LONGEST_WAY, LONGEST_BEFORE)
         needed = sum(len(segment.ids) for segment in prompt)
         room = self.runtime.max_context - self.runtime.max_new_tokens
@@ -196,8 +197,8 @@ class LanguageModel:
     ) -> GenerationRun:
         """A generation whose prompt is given piece by piece; the one before it must be over: they share buffers.
 
-        `cancelled` is asked before every call of a graph, `interrupt` can end one under way, and `before_call` is told
-        for how many ns the next call will take the processor.
+        `cancelled` is called before every call of a graph, `interrupt` can end one under way, and `before_call` takes
+        the expected duration of the next call, ns.
         """
         return GenerationRun(self, cancelled, interrupt, before_call)
 

@@ -50,7 +50,7 @@ class LatencyProfile:
     anchor_after_s: tuple[float, ...] = ()
     """Empty: every newest frame is the one of its generation's start."""
     tagged: str = MODELLED
-    """Whether these are times that a device took, or numbers that somebody set or scaled."""
+    """Whether these are times that a device took, or numbers that were set or scaled."""
 
     def __post_init__(self) -> None:
         times, anchors = self.generation_s, self.anchor_after_s
@@ -153,7 +153,7 @@ def _of_flight_log(path: Path) -> LatencyProfile:
 
 
 def _of_run(path: Path, reasoning: Mapping[str, Any]) -> LatencyProfile:
-    """From percentiles: nobody knows what is below the median, so that half takes the median; above they are joined."""
+    """From percentiles: below the median nothing is known, so that half takes the median; above they are joined."""
 
     def points_s(key: str) -> list[float]:
         values = reasoning.get(key)

@@ -34,7 +34,7 @@ class Policy:
         schedule: Schedule | None = None,
         activity: TickActivity | None = None,
     ) -> None:
-        """`schedule`: where the graphs' own threads run and how urgently; `activity` hears of every call of a tick."""
+        """`schedule`: where the graphs' own threads run and how urgently; `activity` records every call of a tick."""
         control, reasoning = (schedule.control, schedule.reasoning) if schedule else (None, None)
 
         def graph(name: str, cores: Sequence[int]) -> Graph:

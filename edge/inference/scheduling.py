@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from edge.artifacts.manifest import Artifacts
+from edge.core.deadline import run_in_thread
 from edge.core.device import shares_device
 
 Result = TypeVar("Result")
@@ -26,7 +27,7 @@ SPARE_CORES = 1
 """Cores left to camera, odometry and recorder before reasoning's threads are fenced in; with fewer, the operating
 system shares the cores out better than a fence would."""
 ROUND_NS = 1_000_000
-"""How often a waiting reasoning thread looks again."""
+"""Period at which a waiting reasoning thread checks again, ns."""
 GAP_NS = 2_000_000
 """Between a tick's two calls, and after them, the tick is not over yet."""
 
@@ -121,26 +122,18 @@ def _list(cores: Collection[int]) -> str:
     return ", ".join(str(core) for core in sorted(cores))
 
 
-def _set_fifo(priority: int) -> None:
-    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-
-
-def _set_niceness(niceness: int) -> None:
-    # Linux niceness is per thread.
-    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)
-
-
-def _set_cores(cores: Collection[int]) -> None:
-    os.sched_setaffinity(0, cores)
-
-
-@dataclass(frozen=True)
 class ThreadCalls:
     """What sets the calling thread's scheduling; each raises OSError when it is refused."""
 
-    set_cores: Callable[[Collection[int]], None] = _set_cores
-    set_fifo: Callable[[int], None] = _set_fifo
-    set_niceness: Callable[[int], None] = _set_niceness
+    def set_cores(self, cores: Collection[int]) -> None:
+        os.sched_setaffinity(0, cores)
+
+    def set_fifo(self, priority: int) -> None:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+
+    def set_niceness(self, niceness: int) -> None:
+        # Linux niceness is per thread.
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)
 
 
 def enter(role: Role, calls: ThreadCalls | None = None) -> list[str]:
@@ -162,7 +155,7 @@ def enter(role: Role, calls: ThreadCalls | None = None) -> list[str]:
                 f"delay it; allow it with LimitRTPRIO={role.priority} in its service"
             )
     if role.niceness:
-        # A negative value is refused to most users, who have been told about the priority already.
+        # A negative value is refused to most users; the line about the priority covers it.
         with contextlib.suppress(OSError):
             calls.set_niceness(role.niceness)
     return lines
@@ -177,20 +170,12 @@ def run_as(role: Role | None, body: Callable[[], Result]) -> Result:
     if role is None:
         return body()
     results: list[Result] = []
-    errors: list[BaseException] = []
 
     def target() -> None:
         enter(role)
-        try:
-            results.append(body())
-        except BaseException as error:  # noqa: BLE001 - raised again in the caller's thread
-            errors.append(error)
+        results.append(body())
 
-    thread = threading.Thread(target=target, name=f"open-{role.name}")
-    thread.start()
-    thread.join()
-    if errors:
-        raise errors[0]
+    run_in_thread(f"open-{role.name}", target)
     return results[0]
 
 
@@ -225,7 +210,7 @@ def freeze_garbage() -> None:
 
 
 class TickActivity:
-    """What the control thread is computing: it writes instants and waits for nobody, anybody may read them."""
+    """What the control thread is computing: it writes instants and never waits, any thread may read them."""
 
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns
@@ -247,7 +232,7 @@ class TickActivity:
         self._busy = False
 
     def hold_ns(self, now_ns: int, needs_ns: int) -> int:
-        """How long a call that takes `needs_ns` has to wait before it is looked at again; 0: it may start.
+        """How long a call that takes `needs_ns` has to wait before the next check; 0: it may start.
 
         It waits for the tick under way, and for the next one if it would not be over by then. A call that is longer
         than the whole gap starts early in one. Ticks that have stopped are not waited for.

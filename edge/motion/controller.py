@@ -46,7 +46,7 @@ class ControllerInputs:
     speed_scale: float = 1.0
     """Share of the speed limits that may be used, 0..1 (supervisor); whatever lies outside is taken as 0 or 1."""
     hold: str | None = None
-    """Why the velocity must be zero whatever the plan says; None: it need not."""
+    """Why the velocity must be zero whatever the plan; None: it need not."""
 
 
 @dataclass(frozen=True)

@@ -20,28 +20,20 @@ class CameraGeometry:
     """Pinhole with square pixels, mounted `forward_m` ahead of the base origin.
 
     `height_m`: camera above the floor while the robot stands level. `pitch_rad`: how far it looks down from the body's
-    x axis. `centre_right`, `centre_down`: where the optical axis meets the picture, from its middle, in picture widths.
-    Raises ValueError for what no front camera has.
+    x axis. Raises ValueError for what no front camera has.
     """
 
     hfov_rad: float
     height_m: float
     pitch_rad: float
     forward_m: float
-    centre_right: float = 0.0
-    centre_down: float = 0.0
 
     def __post_init__(self) -> None:
         checks = (
             (0.3 <= self.hfov_rad <= 2.8, f"hfov_rad: expected 0.3..2.8, found {self.hfov_rad}"),
             (0.05 <= self.height_m <= 3.0, f"height_m: expected 0.05..3, found {self.height_m}"),
-            (
-                -0.8 <= self.pitch_rad <= 1.4,
-                f"pitch_rad: expected -0.8..1.4, down positive; found {self.pitch_rad}",
-            ),
+            (-0.8 <= self.pitch_rad <= 1.4, f"pitch_rad: expected -0.8..1.4, down positive; found {self.pitch_rad}"),
             (-2.0 <= self.forward_m <= 2.0, f"forward_m: expected -2..2, found {self.forward_m}"),
-            (abs(self.centre_right) <= 0.2, f"centre_right: expected -0.2..0.2, found {self.centre_right}"),
-            (abs(self.centre_down) <= 0.2, f"centre_down: expected -0.2..0.2, found {self.centre_down}"),
         )
         for good, message in checks:
             if not good:
@@ -66,8 +58,8 @@ class FloorProjector:
 
     def __init__(self, geometry: CameraGeometry, width_px: int, height_px: int) -> None:
         self.focal_px = width_px / 2 / math.tan(geometry.hfov_rad / 2)
-        self._cx = (width_px - 1) / 2 + geometry.centre_right * width_px
-        self._cy = (height_px - 1) / 2 + geometry.centre_down * width_px
+        self._cx = (width_px - 1) / 2
+        self._cy = (height_px - 1) / 2
         self._geometry = geometry
 
     def camera_height_m(self, attitude: Attitude) -> float:
@@ -77,7 +69,7 @@ class FloorProjector:
     def floor_points(self, pixels: Array, attitude: Attitude) -> tuple[Array, Array]:
         """Pixels [n, 2] → points on the floor in the level base frame [n, 2], m, and depression below level [n], rad.
 
-        A pixel at or above the horizon gives a point that means nothing: look at its depression.
+        A pixel at or above the horizon gives a meaningless point: check its depression.
         """
         rays = self._level_rays(pixels, attitude)
         horizontal = np.hypot(rays[:, 0], rays[:, 1])

@@ -17,58 +17,50 @@ import numpy as np
 from edge.core.geometry import SE2, wrap_angle
 from edge.odometry import pose_chain
 from edge.odometry.calibration import OdometryCalibration
-from edge.odometry.dead_reckoning import Cursor, Interval, OdometryModel, advance, bent, integrate, split
 from edge.odometry.drift_rate import Comparison, DriftMonitor, DriftRate
-from edge.odometry.gate import GateConfig, Increment, OdometryGate, OdometryInputs, age_findings
-from edge.odometry.pose_chain import HEADING, VISUAL, Array, Node
-from edge.odometry.standing import StillCheck
+from edge.odometry.gate import Increment, OdometryGate, OdometryInputs, StillCheck, age_findings
+from edge.odometry.pose_chain import (
+    HEADING,
+    VISUAL,
+    Array,
+    Cursor,
+    Interval,
+    Node,
+    OdometryModel,
+    advance,
+    bent,
+    integrate,
+    split,
+)
 from edge.odometry.visual_odometry import VisualMotion
 from edge.safety.faults.findings import Finding
 from edge.state.pose_history import StampedPose
-
-__all__ = ["DriftConfig", "DriftEstimator", "OdometryInputs", "OdometryOutputs"]
 
 _SHORT = 1.3
 """Error rate of a few decimetres over that of a metre, in which part of it has already averaged out."""
 
 
-@dataclass(frozen=True)
-class DriftConfig:
-    """How far each source is trusted, and how much of the past is kept."""
-
-    gyro_noise_radps_rthz: float = math.radians(0.08)
-    """White noise of the yaw rate. A bare BMI088 has 0.014 °/s/√Hz (its data sheet); a trot shakes and tilts it."""
-    gyro_bias_walk_radps_rts: float = math.radians(0.008)
-    """A trotting body rolls and pitches, which its own vertical axis takes for a turn: 0.02 to 0.07 °/s, simulated."""
-    scale_walk_rtm: float = 0.005
-    """Change of the odometry's scales per square root of a metre."""
-    visual_scale_sigma: float = 0.007
-    """Error that all visual motions share: of the camera's height and mounting angle."""
-    stamp_sigma_s: float = 0.01
-    """Error of a picture's stamp. A trot sways and yaws fast enough for 10 ms to matter more than the pixels."""
-    visual_gate: float = 25.0
-    """Squared distance, 3 degrees of freedom, beyond which a visual motion is not believed."""
-    prior_m: float = 5.0
-    """The calibration's drift counts as much as this much driving."""
-    history_ns: int = 30_000_000_000
-    node_ns: int = 15_000_000
-    pending_ns: int = 2_000_000_000
-    """How long the pose waits for the camera's word on an interval."""
-    still_ns: int = 300_000_000
-    still_mps: float = 0.05
-    still_radps: float = math.radians(4.0)
-    still_m: float = 0.01
-    command_mps: float = 0.02
-    foot_share: float = 0.2
-    """A foot carries when it feels at least this share of the mean over the feet."""
-    floor_m: float = 0.001
-    floor_rad: float = math.radians(0.05)
-    """What no bookkeeping makes more certain: stamps, interpolation, the sway of the body."""
-
-    def __post_init__(self) -> None:
-        values = [getattr(self, name) for name in self.__dataclass_fields__]
-        if not all(math.isfinite(value) and value > 0 for value in values):
-            raise ValueError(f"drift estimator: expected positive settings, found {self}")
+GYRO_NOISE_RADPS_RTHZ = math.radians(0.08)
+"""White noise of the yaw rate. A bare BMI088 has 0.014 °/s/√Hz (its data sheet); a trot shakes and tilts it."""
+GYRO_BIAS_WALK_RADPS_RTS = math.radians(0.008)
+"""A trotting body rolls and pitches, which its own vertical axis takes for a turn: 0.02 to 0.07 °/s, simulated."""
+SCALE_WALK_RTM = 0.005
+"""Change of the odometry's scales per square root of a metre."""
+VISUAL_SCALE_SIGMA = 0.007
+"""Error that all visual motions share: of the camera's height and mounting angle."""
+STAMP_SIGMA_S = 0.01
+"""Error of a picture's stamp. A trot sways and yaws fast enough for 10 ms to matter more than the pixels."""
+VISUAL_GATE = 25.0
+"""Squared distance, 3 degrees of freedom, beyond which a visual motion is not believed."""
+PRIOR_M = 5.0
+"""The calibration's drift counts as much as this much driving."""
+HISTORY_NS = 30_000_000_000
+NODE_NS = 15_000_000
+PENDING_NS = 2_000_000_000
+"""How long the pose waits for the camera's motion over an interval."""
+FLOOR_M = 0.001
+FLOOR_RAD = math.radians(0.05)
+"""What no bookkeeping makes more certain: stamps, interpolation, the sway of the body."""
 
 
 @dataclass(frozen=True)
@@ -84,20 +76,15 @@ class OdometryOutputs:
 class DriftEstimator:
     """Fuses what one robot reports. `step` belongs to one thread; the other methods may be called from any."""
 
-    def __init__(
-        self,
-        calibration: OdometryCalibration | None = None,
-        config: DriftConfig | None = None,
-        gate: GateConfig | None = None,
-    ) -> None:
-        self._config = config or DriftConfig()
+    def __init__(self, calibration: OdometryCalibration | None = None, stamp_sigma_s: float = STAMP_SIGMA_S) -> None:
+        self._stamp_sigma_s = stamp_sigma_s
         self._calibration = calibration or OdometryCalibration()
-        self._gate = OdometryGate(gate)
+        self._gate = OdometryGate()
         self._visual: deque[VisualMotion] = deque(maxlen=16)
         self._pending: deque[Increment] = deque()
         self._commit: Cursor | None = None
         self._live: Cursor | None = None
-        # Published as a whole: (nodes, newest); nobody ever changes a list that has been published.
+        # Published as a whole: (nodes, newest); a published list never changes.
         self._published: tuple[list[Node], Node] | None = None
         known = self._calibration
         self._model = OdometryModel(
@@ -107,18 +94,14 @@ class DriftEstimator:
             sideways=known.sideways_m_per_m,
             scale_y=known.scale_y,
             scale_yaw=known.scale_yaw,
-            gyro_noise_radps_rthz=self._config.gyro_noise_radps_rthz,
+            gyro_noise_radps_rthz=GYRO_NOISE_RADPS_RTHZ,
             rate_m_per_m=known.drift_m_per_m,
             rate_rad_per_m=known.drift_rad_per_m,
         )
         self._visual_scale = 0.0
         self._covariance = np.zeros((4, 4))
         self._drift, self._residual = DriftMonitor(), DriftMonitor()
-        c = self._config
-        self._still = StillCheck(
-            after_ns=c.still_ns, max_mps=c.still_mps, max_radps=c.still_radps, max_m=c.still_m,
-            max_command_mps=c.command_mps, foot_share=c.foot_share,
-        )  # fmt: skip
+        self._still = StillCheck()
         self.visual_used = 0
         self.visual_rejected = 0
 
@@ -149,7 +132,7 @@ class DriftEstimator:
         if anchor is None:
             return None
         offset, covariance = pose_chain.relative(anchor, newest)
-        return offset, covariance + np.diag((self._config.floor_m**2,) * 2 + (self._config.floor_rad**2,))
+        return offset, covariance + np.diag((FLOOR_M**2,) * 2 + (FLOOR_RAD**2,))
 
     def step(self, report: OdometryInputs, now_ns: int) -> OdometryOutputs:
         """Take one report as it arrives; the pose, what is wrong, and how much the robot's odometry drifts."""
@@ -171,14 +154,14 @@ class DriftEstimator:
         self._live = advance(self._live, increment, self._model)
         self._see()
         self._publish()
-        self._settle(increment.end_ns - self._config.pending_ns)
+        self._settle(increment.end_ns - PENDING_NS)
         return OdometryOutputs(self._stamped(report, standing), findings, self._drift.rate(), standing)
 
     def _start(self, report: OdometryInputs) -> StampedPose:
         known, has_gyro = self._calibration, report.gyro_wz_radps is not None
         heading_sigma = known.gyro_bias_sigma_radps if has_gyro else known.drift_rad_per_m
         self._model = replace(self._model, has_gyro=has_gyro, heading=known.gyro_bias_radps if has_gyro else 0.0)
-        sigmas = (heading_sigma, known.scale_x_sigma, known.sideways_sigma, self._config.visual_scale_sigma)
+        sigmas = (heading_sigma, known.scale_x_sigma, known.sideways_sigma, VISUAL_SCALE_SIGMA)
         self._covariance = np.diag(np.square(sigmas))
         node = pose_chain.origin(report.received_ns, report.T_odom_base, self._covariance)
         self._commit = self._live = Cursor(node, 0.0)
@@ -204,7 +187,7 @@ class DriftEstimator:
             return
         rate_radps, seconds = measured
         row = self._covariance[HEADING]
-        gain = row / (row[HEADING] + self._config.gyro_noise_radps_rthz**2 / seconds)
+        gain = row / (row[HEADING] + GYRO_NOISE_RADPS_RTHZ**2 / seconds)
         self._learn(gain * (rate_radps - self._model.heading), self._covariance - np.outer(gain, row))
 
     def _learn(self, change: Array, covariance: Array) -> None:
@@ -220,8 +203,8 @@ class DriftEstimator:
     def _publish(self) -> None:
         assert self._published is not None and self._live is not None
         nodes, node = self._published[0], self._live.node
-        if node.stamp_ns - nodes[-1].stamp_ns >= self._config.node_ns:
-            oldest_ns = node.stamp_ns - self._config.history_ns
+        if node.stamp_ns - nodes[-1].stamp_ns >= NODE_NS:
+            oldest_ns = node.stamp_ns - HISTORY_NS
             # Two are dropped for one that comes: one more than the time asked for always stays.
             first = 2 if len(nodes) > 2 and nodes[2].stamp_ns < oldest_ns else 0
             nodes = [*nodes[first:], node]
@@ -267,7 +250,7 @@ class DriftEstimator:
         innovation[2] = wrap_angle(float(innovation[2]))
         model = by - interval.gains
         total = model @ self._covariance @ model.T + visual + interval.white
-        if not float(innovation @ np.linalg.solve(total, innovation)) <= self._config.visual_gate:  # also for NaN
+        if not float(innovation @ np.linalg.solve(total, innovation)) <= VISUAL_GATE:  # also for NaN
             return False
         gain = self._covariance @ model.T @ np.linalg.inv(total)
         change = gain @ innovation
@@ -290,22 +273,17 @@ class DriftEstimator:
         if seconds <= 0:
             return np.zeros((3, 3))
         shares = [
-            (
-                increment.dx_m**2 / increment.dt_s,
-                increment.dy_m**2 / increment.dt_s,
-                increment.turn_rad**2 / increment.dt_s,
-            )
-            for increment in inside
-            if increment.dt_s > 0
+            (part.dx_m**2 / part.dt_s, part.dy_m**2 / part.dt_s, part.turn_rad**2 / part.dt_s)
+            for part in inside
+            if part.dt_s > 0
         ]
         mean_squares = np.sum(shares, axis=0) / seconds
-        return np.diag(2 * self._config.stamp_sigma_s**2 * mean_squares)
+        return np.diag(2 * self._stamp_sigma_s**2 * mean_squares)
 
     def _walk(self, interval: Interval, seen: VisualMotion) -> Array:
-        config = self._config
         seconds = (seen.end_ns - seen.start_ns) / 1e9
-        scale = config.scale_walk_rtm**2 * interval.distance_m
-        heading = config.gyro_bias_walk_radps_rts**2 * seconds if self._model.has_gyro else scale
+        scale = SCALE_WALK_RTM**2 * interval.distance_m
+        heading = GYRO_BIAS_WALK_RADPS_RTS**2 * seconds if self._model.has_gyro else scale
         return np.diag((heading, scale, scale, 0.0))
 
     def _compare(self, interval: Interval, observed: Array, turn_rad: float, visual: Array, white: Array) -> None:
@@ -321,7 +299,7 @@ class DriftEstimator:
             monitor.add(Comparison(distance, forward, left, yaw, variance_m2, variance_rad2))
         rate, known = self._residual.rate(), self._calibration
         if rate.m_per_m is not None and rate.rad_per_m is not None:
-            weight, prior = min(rate.distance_m, 20.0), self._config.prior_m
+            weight, prior = min(rate.distance_m, 20.0), PRIOR_M
             a, b = math.sqrt(prior / (prior + weight)), math.sqrt(weight / (prior + weight))
             self._model = replace(
                 self._model,
@@ -355,6 +333,6 @@ class DriftEstimator:
         self._pending = deque(after)
         spaced = [*kept]
         for node in nodes:
-            if not spaced or node.stamp_ns - spaced[-1].stamp_ns >= self._config.node_ns or node is end:
+            if not spaced or node.stamp_ns - spaced[-1].stamp_ns >= NODE_NS or node is end:
                 spaced.append(node)
         self._published = (spaced, cursor.node)

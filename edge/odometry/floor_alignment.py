@@ -20,43 +20,31 @@ Picture = npt.NDArray[np.float32]
 _STEPS = np.array((1e-4, 1e-4, 1e-4, 1e-3, 1e-4, 1e-4, 1e-4))
 
 
-@dataclass(frozen=True)
-class AlignmentConfig:
-    """Noise of the measurements, and which part of the floor is compared."""
-
-    pixel_sigma: float = 0.15
-    """Of a tracked corner, at least."""
-    inlier_px: float = 1.5
-    attitude_sigma_rad: float = math.radians(0.15)
-    height_sigma: float = 0.01
-    """Relative error of the height between two frames."""
-    tilt_sigma_rad: float = math.radians(0.1)
-    """What one pair of pictures may say about the camera's angle to the floor."""
-    grey_sigma: float = 1.5
-    """Of a pixel of a smoothed picture, at least."""
-    smooth_px: float = 1.0
-    points: int = 500
-    min_points: int = 150
-    min_gradient: float = 2.5
-    """Grey levels a pixel: flatter floor says nothing."""
-    range_m: float = 2.6
-    half_width_m: float = 1.6
-    min_share: float = 0.5
-    settle_m: float = 0.06
-    settle_rad: float = math.radians(3.0)
-    """How far the pictures may lead from where the corners pointed."""
-    correlation: float = 8.5
-    """By how much the covariance of independent pixels is too small: neighbours share blur, texture and sampling."""
-
-    def __post_init__(self) -> None:
-        if not all(math.isfinite(getattr(self, n)) and getattr(self, n) > 0 for n in self.__dataclass_fields__):
-            raise ValueError(f"floor alignment: expected positive settings, found {self}")
-
-    @property
-    def prior(self) -> Array:
-        """Information [6] on the six unknowns."""
-        sigmas = np.array((np.inf, np.inf, np.inf, self.height_sigma, *[self.attitude_sigma_rad] * 2))
-        return np.asarray(1 / sigmas**2, dtype=np.float64)
+PIXEL_SIGMA = 0.15
+"""Of a tracked corner, at least."""
+INLIER_PX = 1.5
+ATTITUDE_SIGMA_RAD = math.radians(0.15)
+HEIGHT_SIGMA = 0.01
+"""Relative error of the height between two frames."""
+TILT_SIGMA_RAD = math.radians(0.1)
+"""What one pair of pictures may say about the camera's angle to the floor."""
+GREY_SIGMA = 1.5
+"""Of a pixel of a smoothed picture, at least."""
+SMOOTH_PX = 1.0
+POINTS = 500
+MIN_POINTS = 150
+MIN_GRADIENT = 2.5
+"""Grey levels a pixel: flatter floor gives no information."""
+RANGE_M = 2.6
+HALF_WIDTH_M = 1.6
+MIN_SHARE = 0.5
+SETTLE_M = 0.06
+SETTLE_RAD = math.radians(3.0)
+"""How far the pictures may lead from where the corners pointed."""
+CORRELATION = 8.5
+"""By how much the covariance of independent pixels is too small: neighbours share blur, texture and sampling."""
+_PRIOR: Array = np.array((0.0, 0.0, 0.0, HEIGHT_SIGMA**-2, ATTITUDE_SIGMA_RAD**-2, ATTITUDE_SIGMA_RAD**-2))
+"""Information [6] on the six unknowns."""
 
 
 @dataclass(frozen=True)
@@ -75,24 +63,27 @@ class Solution:
     tilt_sigma_rad: float = math.inf
 
 
-def smooth(grey: npt.NDArray[np.uint8], config: AlignmentConfig) -> Picture:
+def smooth(grey: npt.NDArray[np.uint8]) -> Picture:
     """The picture as it is compared: without the finest detail, which no sampling reproduces."""
-    return np.asarray(cv2.GaussianBlur(grey.astype(np.float32), (0, 0), config.smooth_px), dtype=np.float32)
+    return np.asarray(cv2.GaussianBlur(grey.astype(np.float32), (0, 0), SMOOTH_PX), dtype=np.float32)
 
 
 def fit_corners(
-    projector: FloorProjector, before: Array, seen: Array, attitude: Attitude, start: Array, config: AlignmentConfig
+    projector: FloorProjector, before: Array, seen: Array, attitude: Attitude, start: Array
 ) -> Solution | None:
     """Fit floor points [n, 2] of the earlier frame to pixels [n, 2] of the later one; None when it does not settle."""
     q = np.concatenate((start, np.zeros(3)))
-    outlier = 2 * config.inlier_px
+    outlier = 2 * INLIER_PX
     normal = np.eye(6)
     weight = np.zeros(len(before))
     jacobian = np.zeros((len(before), 2, 6))
     for iteration in range(8):
         # The derivatives hardly change within a few pixels, and cost six times as much as the residuals.
         if iteration in (0, 2):
-            at, jacobian = _pixels_of(projector, before, attitude, q)
+            at = _project(projector, before, attitude, q)
+            steps = np.diag(_STEPS)[:6, :6]
+            moved = [_project(projector, before, attitude, q + step) - at for step in steps]
+            jacobian = np.stack([change / step.sum() for change, step in zip(moved, steps, strict=True)], axis=-1)
         else:
             at = _project(projector, before, attitude, q)
         r = at - seen
@@ -100,11 +91,11 @@ def fit_corners(
         close = size < outlier
         if np.count_nonzero(close) < 6:
             return None
-        sigma = max(config.pixel_sigma, 1.4826 * float(np.median(np.abs(r[close]))))
+        sigma = max(PIXEL_SIGMA, 1.4826 * float(np.median(np.abs(r[close]))))
         weight = np.clip(1 - (size / min(outlier, 4.7 * sigma)) ** 2, 0, None) ** 2
         weighted = jacobian * (weight / sigma**2)[:, None, None]
-        normal = np.einsum("nki,nkj->ij", weighted, jacobian) + np.diag(config.prior)
-        step = _solve(normal, np.einsum("nki,nk->i", weighted, r) + config.prior * q)
+        normal = np.einsum("nki,nkj->ij", weighted, jacobian) + np.diag(_PRIOR)
+        step = _solve(normal, np.einsum("nki,nk->i", weighted, r) + _PRIOR * q)
         if step is None:
             return None
         q = q + step
@@ -118,23 +109,23 @@ def fit_corners(
 
 def align_pictures(
     projector: FloorProjector, key: Picture, key_attitude: Attitude, now: Picture, attitude: Attitude,
-    start: Array, floor: npt.NDArray[np.uint8], config: AlignmentConfig,
+    start: Array, floor: npt.NDArray[np.uint8],
 ) -> Solution | None:  # fmt: skip
     """Fit the later smoothed picture to the earlier one where `floor` is set; `start` [6] must be within a few pixels.
 
-    Edges count as much as corners here, each by the direction that it can tell. None when it does not settle.
+    Edges count as much as corners here, each in the direction that it constrains. None when it does not settle.
     """
-    pixels = _strong_pixels(key, floor, config)
+    pixels = _strong_pixels(key, floor)
     points, _ = projector.floor_points(pixels.astype(np.float64), key_attitude)
-    near = (points[:, 0] < config.range_m) & (np.abs(points[:, 1]) < config.half_width_m)
+    near = (points[:, 0] < RANGE_M) & (np.abs(points[:, 1]) < HALF_WIDTH_M)
     pixels, points = pixels[near], points[near]
-    if len(pixels) < config.min_points:
+    if len(pixels) < MIN_POINTS:
         return None
     wanted = key[pixels[:, 1], pixels[:, 0]].astype(np.float64)
     # Half of the next and half of the previous pixel: the derivative of the picture that is sampled linearly below.
     slope = _slopes(now)
     q, normal = np.append(start, 0.0), np.eye(7)
-    prior = np.append(config.prior, 1 / config.tilt_sigma_rad**2) * config.correlation
+    prior = np.append(_PRIOR, 1 / TILT_SIGMA_RAD**2) * CORRELATION
     chosen = pixels.astype(np.float64)
     height, width = now.shape
     weight = np.zeros(0)
@@ -154,12 +145,12 @@ def align_pictures(
         else:
             at = reprojected(q)
         inside = (at[:, 0] > 2) & (at[:, 0] < width - 3) & (at[:, 1] > 2) & (at[:, 1] < height - 3)
-        if np.count_nonzero(inside) < config.min_points:
+        if np.count_nonzero(inside) < MIN_POINTS:
             return None
         spots = at[inside].astype(np.float32)
         r = _sampled(now, spots) - wanted[inside]
         r = r - np.median(r)  # exposure may change
-        sigma = max(config.grey_sigma, 1.4826 * float(np.median(np.abs(r))))
+        sigma = max(GREY_SIGMA, 1.4826 * float(np.median(np.abs(r))))
         weight = np.clip(1 - (r / (4.7 * sigma)) ** 2, 0, None) ** 2
         if iteration in (0, 2):
             slopes = np.zeros((len(points), 2))
@@ -177,24 +168,16 @@ def align_pictures(
     inverse = _inverse(normal)
     if inverse is None:
         return None
-    covariance = config.correlation * inverse
+    covariance = CORRELATION * inverse
     # Take the prior out again: a sum of many such answers must not count it many times.
-    told = 1.0 - float(covariance[6, 6]) / config.tilt_sigma_rad**2
+    information = 1.0 - float(covariance[6, 6]) / TILT_SIGMA_RAD**2
     tilt_rad, tilt_sigma_rad = 0.0, math.inf
-    if told > 0.02:
-        tilt_rad, tilt_sigma_rad = float(q[6]) / told, config.tilt_sigma_rad * math.sqrt((1 - told) / told)
+    if information > 0.02:
+        tilt_rad, tilt_sigma_rad = (
+            float(q[6]) / information,
+            TILT_SIGMA_RAD * math.sqrt((1 - information) / information),
+        )
     return Solution(q, covariance[:3, :3], inliers, inliers / len(weight), tilt_rad, tilt_sigma_rad)
-
-
-def _pixels_of(projector: FloorProjector, points: Array, attitude: Attitude, q: Array) -> tuple[Array, Array]:
-    """Where floor points of the earlier frame are seen in the later one, [n, 2], and derivatives [n, 2, 6]."""
-    at = _project(projector, points, attitude, q)
-    steps = [(_project(projector, points, attitude, q + step) - at) / step.sum() for step in np.diag(_STEPS)[:6, :6]]
-    return at, np.stack(steps, axis=-1)
-
-
-def _tilted(attitude: Attitude, tilt_rad: float) -> Attitude:
-    return replace(attitude, pitch_rad=attitude.pitch_rad + tilt_rad)
 
 
 def _project(projector: FloorProjector, points: Array, attitude: Attitude, q: Array) -> Array:
@@ -223,11 +206,11 @@ def _inverse(normal: Array) -> Array | None:
     return inverse if np.all(np.isfinite(inverse)) and np.all(np.diag(inverse) > 0) else None
 
 
-def _strong_pixels(key: Picture, floor: npt.NDArray[np.uint8], config: AlignmentConfig) -> npt.NDArray[np.int64]:
+def _strong_pixels(key: Picture, floor: npt.NDArray[np.uint8]) -> npt.NDArray[np.int64]:
     """Pixels [n, 2] (column, row) of the floor with enough slope, evenly thinned to about `points`."""
     gx, gy = _slopes(key)
-    rows, columns = np.nonzero((np.hypot(gx, gy) > config.min_gradient) & (floor > 0))
-    every = max(1, len(rows) // config.points)
+    rows, columns = np.nonzero((np.hypot(gx, gy) > MIN_GRADIENT) & (floor > 0))
+    every = max(1, len(rows) // POINTS)
     return np.stack((columns[::every], rows[::every]), axis=1)
 
 

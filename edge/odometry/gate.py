@@ -17,35 +17,40 @@ MAX_NUMBER = 1e7
 """A position, angle or speed beyond it is no measurement, and would break arithmetic."""
 
 
-@dataclass(frozen=True)
-class GateConfig:
-    """Bounds of the checks; the defaults are the fault matrix's and the Go2's own limits (3.8 m/s, 4 rad/s)."""
+# Bounds of the checks: the fault matrix's, and the Go2's own limits (3.8 m/s, 4 rad/s).
+MAX_SPEED_MPS = 4.0
+MAX_TURN_RADPS = 6.0
+JUMP_M = 0.25
+"""What a report may deviate beyond what top speed explains: jitter of its arrival."""
+JUMP_RAD = 0.35
+FROZEN_COMMAND_MPS = 0.2
+FROZEN_NS = 500_000_000
+FROZEN_M = 0.01
+FROZEN_RAD = 0.02
+MISMATCH_MPS = 0.5
+MISMATCH_RADPS = 0.5
+MISMATCH_WINDOW_NS = 200_000_000
+CLOCK_DRIFT = 100e-6
+"""How fast the robot's clock may run away from ours; what goes beyond it is a delay, however long it lasts."""
+CLOCK_BACK_NS = 100_000_000
+CLOCK_STEP_NS = 5_000_000_000
+"""The robot's clock was set when its stamps go back by more than the first, or apart from ours by the second."""
 
-    max_speed_mps: float = 4.0
-    max_turn_radps: float = 6.0
-    jump_m: float = 0.25
-    """What a report may deviate beyond what top speed explains: jitter of its arrival."""
-    jump_rad: float = 0.35
-    norm_tolerance: float = 0.05
-    frozen_command_mps: float = 0.2
-    frozen_ns: int = 500_000_000
-    frozen_m: float = 0.01
-    frozen_rad: float = 0.02
-    mismatch_mps: float = 0.5
-    mismatch_radps: float = 0.5
-    mismatch_window_ns: int = 200_000_000
-    clock_drift: float = 100e-6
-    """How fast the robot's clock may run away from ours; what goes beyond it is a delay, however long it lasts."""
-    clock_back_ns: int = 100_000_000
-    clock_step_ns: int = 5_000_000_000
-    """The robot's clock was set when its stamps go back by more than the first, or apart from ours by the second."""
+# Every sign that the protocol carries stays below these for STILL_NS: the robot stands.
+STILL_NS = 300_000_000
+STILL_MPS = 0.05
+STILL_RADPS = math.radians(4.0)
+STILL_M = 0.01
+COMMAND_MPS = 0.02
+FOOT_SHARE = 0.2
+"""A foot carries when it feels at least this share of the mean over the feet."""
 
 
 @dataclass(frozen=True)
 class OdometryInputs:
     """One report of the robot, as it came: numbers may be anything. `commanded` is the velocity in force (body frame).
 
-    `quaternion_norm`, `gyro_wz_radps`, `foot_forces`, `commanded` are None where the protocol does not carry them;
+    `gyro_wz_radps`, `foot_forces`, `commanded` are None where the protocol does not carry them;
     `robot_stamp_ns` is the robot's clock, 0 without one.
     """
 
@@ -58,7 +63,6 @@ class OdometryInputs:
     roll_rad: float = 0.0
     pitch_rad: float = 0.0
     robot_stamp_ns: int = 0
-    quaternion_norm: float | None = None
     foot_forces: tuple[float, ...] | None = None
     commanded: tuple[float, float, float] | None = None
 
@@ -98,8 +102,7 @@ def age_findings(age_ns: int) -> tuple[Finding, ...]:
 class OdometryGate:
     """Checks reports in their order of arrival and turns the good ones into increments."""
 
-    def __init__(self, config: GateConfig | None = None) -> None:
-        self._config = config or GateConfig()
+    def __init__(self) -> None:
         self._last: OdometryInputs | None = None
         self._suspect: OdometryInputs | None = None
         self._apart: deque[tuple[float, float, float, float]] = deque()
@@ -111,7 +114,7 @@ class OdometryGate:
 
     def step(self, report: OdometryInputs) -> Verdict:
         """Judge one report."""
-        if not _finite(report, self._config.norm_tolerance):
+        if not _finite(report):
             self.rejected += 1
             return Verdict(None, (Finding("odometry-not-finite", f"pose {report.T_odom_base}"),))
         findings = age_findings(self._lag_ns(report))
@@ -128,7 +131,7 @@ class OdometryGate:
             suspect_dt_s = elapsed_s(self._suspect, report)
             if suspect_dt_s > 0 and not self._jump(self._suspect, report, suspect_dt_s):
                 # It stays where it jumped to: go on from there. The step itself is no motion; the reported velocity
-                # says what was driven meanwhile.
+                # gives what was driven meanwhile.
                 return self._accept(self._suspect, report, suspect_dt_s, findings, bridged=last)
         if jumped:
             again = self._suspect is not None
@@ -170,10 +173,9 @@ class OdometryGate:
         return Verdict(increment, (*findings, *mismatch, *frozen))
 
     def _jump(self, before: OdometryInputs, report: OdometryInputs, dt_s: float) -> bool:
-        config = self._config
         x, y, turn = _moved(before, report)
-        far = math.hypot(x, y) > config.jump_m + config.max_speed_mps * dt_s
-        return far or abs(turn) > config.jump_rad + config.max_turn_radps * dt_s
+        far = math.hypot(x, y) > JUMP_M + MAX_SPEED_MPS * dt_s
+        return far or abs(turn) > JUMP_RAD + MAX_TURN_RADPS * dt_s
 
     def _mismatch(
         self, moved: tuple[float, float, float], dt_s: float, report: OdometryInputs, gyro_radps: float | None
@@ -182,17 +184,16 @@ class OdometryGate:
 
         Also whether the gyro disagrees: a stuck one shows nothing while the robot turns.
         """
-        config = self._config
         dx_m, dy_m, turn_rad = moved
-        window_s = config.mismatch_window_ns / 1e9
+        window_s = MISMATCH_WINDOW_NS / 1e9
         if dt_s > 0.5 * window_s:
-            # Two readings do not tell the motion over a long gap: the robot may have been stopped in it.
+            # Two readings do not determine the motion over a long gap: the robot may have been stopped in it.
             self._apart.clear()
             self._apart_sums = [0.0] * len(self._apart_sums)
             return (), False
         # A pose that does not change at all is row 9's.
-        told = gyro_radps is not None and any(moved)
-        turned_apart = turn_rad - gyro_radps * dt_s if told and gyro_radps is not None else 0.0
+        has_turn_rates = gyro_radps is not None and any(moved)
+        turned_apart = turn_rad - gyro_radps * dt_s if has_turn_rates and gyro_radps is not None else 0.0
         sums = self._apart_sums
         self._apart.append((dt_s, dx_m - report.vx_mps * dt_s, dy_m - report.vy_mps * dt_s, turned_apart))
         for index, value in enumerate(self._apart[-1]):
@@ -205,31 +206,31 @@ class OdometryGate:
             return (), False
         apart_mps, apart_radps = math.hypot(sums[1], sums[2]) / sums[0], abs(sums[3]) / sums[0]
         findings: tuple[Finding, ...] = ()
-        if apart_mps > config.mismatch_mps:
-            detail = f"{apart_mps:.2f} m/s apart, at most {config.mismatch_mps} m/s"
+        if apart_mps > MISMATCH_MPS:
+            detail = f"{apart_mps:.2f} m/s apart, at most {MISMATCH_MPS} m/s"
             findings = (Finding("odometry-speed-mismatch", detail),)
-        if apart_radps > config.mismatch_radps:
-            detail = f"gyro and reported yaw {apart_radps:.2f} rad/s apart, at most {config.mismatch_radps} rad/s"
+        if apart_radps > MISMATCH_RADPS:
+            detail = f"gyro and reported yaw {apart_radps:.2f} rad/s apart, at most {MISMATCH_RADPS} rad/s"
             findings = (*findings, Finding("odometry-speed-mismatch", detail))
-        return findings, apart_radps > config.mismatch_radps
+        return findings, apart_radps > MISMATCH_RADPS
 
     def _frozen(self, report: OdometryInputs) -> tuple[Finding, ...]:
         """Row 9, once for every try: the zero that follows ends the try, so that staying frozen shows in a second one.
 
         Whether a robot at zero would move cannot be seen: the next command tries again, and the table counts.
         """
-        config, command = self._config, report.commanded
-        if command is None or math.hypot(command[0], command[1]) <= config.frozen_command_mps:
+        command = report.commanded
+        if command is None or math.hypot(command[0], command[1]) <= FROZEN_COMMAND_MPS:
             self._pushed_since_ns = None
             return ()
         x, y, theta = report.T_odom_base
         px, py, ptheta = self._pushed_from
-        moved = math.hypot(x - px, y - py) > config.frozen_m or abs(wrap_angle(theta - ptheta)) > config.frozen_rad
+        moved = math.hypot(x - px, y - py) > FROZEN_M or abs(wrap_angle(theta - ptheta)) > FROZEN_RAD
         if self._pushed_since_ns is None or moved:
             self._pushed_since_ns, self._pushed_from = report.received_ns, report.T_odom_base
             return ()
         held_ns = report.received_ns - self._pushed_since_ns
-        if held_ns < config.frozen_ns:
+        if held_ns < FROZEN_NS:
             return ()
         self._pushed_since_ns = report.received_ns
         return (
@@ -238,14 +239,14 @@ class OdometryGate:
 
     def _lag_ns(self, report: OdometryInputs) -> int:
         """How much later than the quickest report so far this one came, by the robot's own clock."""
-        received_ns, stamp_ns, config = report.received_ns, report.robot_stamp_ns, self._config
+        received_ns, stamp_ns = report.received_ns, report.robot_stamp_ns
         if stamp_ns <= 0:
             return 0
         offset_ns = received_ns - stamp_ns
         if self._quickest is not None:
             at_ns, least_ns, last_ns = self._quickest
-            lag_ns = offset_ns - least_ns - round(config.clock_drift * (received_ns - at_ns))
-            if 0 < lag_ns <= config.clock_step_ns and stamp_ns > last_ns - config.clock_back_ns:
+            lag_ns = offset_ns - least_ns - round(CLOCK_DRIFT * (received_ns - at_ns))
+            if 0 < lag_ns <= CLOCK_STEP_NS and stamp_ns > last_ns - CLOCK_BACK_NS:
                 self._quickest = (at_ns, least_ns, max(stamp_ns, last_ns))
                 return lag_ns
         self._quickest = (received_ns, offset_ns, stamp_ns)
@@ -257,18 +258,16 @@ def elapsed_s(before: OdometryInputs, after: OdometryInputs) -> float:
     received_s = (after.received_ns - before.received_ns) / 1e9
     if before.robot_stamp_ns > 0 and after.robot_stamp_ns > 0:
         robot_s = (after.robot_stamp_ns - before.robot_stamp_ns) / 1e9
-        # A clock that was set does not tell how long it took.
+        # A clock that was set measures no duration.
         return robot_s if 0 < robot_s < received_s + 1.0 else received_s
     return received_s
 
 
-def _finite(report: OdometryInputs, norm_tolerance: float) -> bool:
+def _finite(report: OdometryInputs) -> bool:
     gyro = report.gyro_wz_radps
     values = (*report.T_odom_base, report.vx_mps, report.vy_mps, report.wz_radps, 0.0 if gyro is None else gyro,
               report.roll_rad, report.pitch_rad)  # fmt: skip
-    if not all(abs(value) <= MAX_NUMBER for value in values):  # False for NaN
-        return False
-    return report.quaternion_norm is None or abs(report.quaternion_norm - 1.0) <= norm_tolerance
+    return all(abs(value) <= MAX_NUMBER for value in values)  # False for NaN
 
 
 def _moved(before: OdometryInputs, after: OdometryInputs) -> tuple[float, float, float]:
@@ -278,3 +277,44 @@ def _moved(before: OdometryInputs, after: OdometryInputs) -> tuple[float, float,
     turn = wrap_angle(t1 - t0)
     c, s = math.cos(t0 + turn / 2), math.sin(t0 + turn / 2)
     return c * (x1 - x0) + s * (y1 - y0), c * (y1 - y0) - s * (x1 - x0), turn
+
+
+class StillCheck:
+    """Every sign that the protocol carries must say so for a while: speed, turn, position, command, and feet."""
+
+    def __init__(self) -> None:
+        self._since_ns: int | None = None
+        self._at = (0.0, 0.0)
+        self._turned_rad = 0.0
+        self._seconds = 0.0
+
+    def step(self, report: OdometryInputs, increment: Increment, gyro_bias_radps: float) -> bool:
+        """Whether the robot stands, by this report and those before it."""
+        x, y, _ = report.T_odom_base
+        if self._since_ns is not None:
+            quiet = self._quiet(report, gyro_bias_radps) and math.dist(self._at, (x, y)) <= STILL_M
+            if quiet:
+                self._turned_rad += increment.turn_rad
+                self._seconds += increment.dt_s
+                return report.received_ns - self._since_ns >= STILL_NS
+        self._since_ns = report.received_ns if self._quiet(report, gyro_bias_radps) else None
+        self._at, self._turned_rad, self._seconds = (x, y), 0.0, 0.0
+        return False
+
+    def take_rate(self) -> tuple[float, float] | None:
+        """Mean yaw rate at rest, rad/s, and over how many s, once there is enough of it; each is given only once."""
+        if self._seconds * 1e9 < STILL_NS:
+            return None
+        taken = (self._turned_rad / self._seconds, self._seconds)
+        self._turned_rad = self._seconds = 0.0
+        return taken
+
+    def _quiet(self, report: OdometryInputs, gyro_bias_radps: float) -> bool:
+        rate = report.wz_radps if report.gyro_wz_radps is None else report.gyro_wz_radps - gyro_bias_radps
+        if math.hypot(report.vx_mps, report.vy_mps) > STILL_MPS or abs(rate) > STILL_RADPS:
+            return False
+        if report.commanded is not None and max(map(abs, report.commanded)) > COMMAND_MPS:
+            return False
+        feet = report.foot_forces
+        # A robot without foot sensors reports zeros.
+        return feet is None or not any(feet) or min(feet) * len(feet) >= FOOT_SHARE * sum(feet)

@@ -8,7 +8,7 @@ blur or a crowd, there is no answer instead of a bad one. A few milliseconds a f
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -17,52 +17,45 @@ import numpy.typing as npt
 from edge.core.geometry import SE2
 from edge.core.jpeg import jpeg_refusal, jpeg_size
 from edge.odometry.camera_geometry import Array, Attitude, CameraGeometry, FloorProjector, seen_from
-from edge.odometry.floor_alignment import AlignmentConfig, Picture, Solution, align_pictures, fit_corners, smooth
+from edge.odometry.floor_alignment import (
+    INLIER_PX,
+    MIN_SHARE,
+    SETTLE_M,
+    SETTLE_RAD,
+    Picture,
+    Solution,
+    align_pictures,
+    fit_corners,
+    smooth,
+)
 
 Grey = npt.NDArray[np.uint8]
 Covariance = tuple[float, float, float, float, float, float, float, float, float]
 """Row-major 3 × 3 over (x m, y m, θ rad)."""
 
 
-@dataclass(frozen=True)
-class VisualConfig:
-    """How corners are chosen, when an answer is given, and how far the attitude is trusted between two frames."""
-
-    max_corners: int = 80
-    min_corners: int = 12
-    renew_corners: int = 18
-    """With fewer left, an answer is given while it can be."""
-    min_depression_rad: float = math.radians(7.0)
-    """Floor nearer to the horizon than this moves too little to tell anything."""
-    keyframe_distance_m: float = 0.25
-    keyframe_turn_rad: float = math.radians(8.0)
-    keyframe_age_ns: int = 1_000_000_000
-    max_gap_ns: int = 500_000_000
-    """Corners are not followed across a longer pause between frames."""
-    min_inlier_share: float = 0.4
-    min_brightness: float = 12.0
-    """Mean grey value, 0..255."""
-    hypotheses: int = 64
-    tilt_sigma_rad: float = math.radians(0.2)
-    """Error of the camera's angle to the floor: mounting, lens centre and the robot's own attitude together."""
-    tilt_caution: float = 2.0
-    """One answer about it errs by this much more than its pixels say: their errors are alike from frame to frame."""
-    tilt_floor_rad: float = math.radians(0.03)
-    """It is never known better than this, and so goes on being learned."""
-    max_tilt_rad: float = math.radians(1.0)
-    alignment: AlignmentConfig = field(default_factory=AlignmentConfig)
-
-    def __post_init__(self) -> None:
-        if not 6 <= self.min_corners <= self.max_corners <= 1000:
-            raise ValueError("visual odometry: expected 6 <= min_corners <= max_corners <= 1000, found "
-                             f"{self.min_corners} and {self.max_corners}")  # fmt: skip
-        positive = (
-            self.min_depression_rad, self.keyframe_distance_m, self.keyframe_turn_rad, self.keyframe_age_ns,
-            self.max_gap_ns, self.hypotheses, self.tilt_sigma_rad, self.tilt_caution, self.tilt_floor_rad,
-            self.max_tilt_rad,
-        )  # fmt: skip
-        if not all(math.isfinite(v) and v > 0 for v in positive) or not 0 < self.min_inlier_share <= 1:
-            raise ValueError(f"visual odometry: expected positive settings, found {self}")
+MAX_CORNERS = 80
+MIN_CORNERS = 12
+RENEW_CORNERS = 18
+"""With fewer left, an answer is given while it can be."""
+MIN_DEPRESSION_RAD = math.radians(7.0)
+"""Floor nearer to the horizon than this moves too little to measure."""
+KEYFRAME_DISTANCE_M = 0.25
+KEYFRAME_TURN_RAD = math.radians(8.0)
+KEYFRAME_AGE_NS = 1_000_000_000
+MAX_GAP_NS = 500_000_000
+"""Corners are not followed across a longer pause between frames."""
+MIN_INLIER_SHARE = 0.4
+MIN_BRIGHTNESS = 12.0
+"""Mean grey value, 0..255."""
+HYPOTHESES = 64
+TILT_SIGMA_RAD = math.radians(0.2)
+"""Error of the camera's angle to the floor: mounting, lens centre and the robot's own attitude together."""
+TILT_CAUTION = 2.0
+"""One answer about it errs by this much more than its pixels say: their errors are alike from frame to frame."""
+TILT_FLOOR_RAD = math.radians(0.03)
+"""It is never known better than this, and so goes on being learned."""
+MAX_TILT_RAD = math.radians(1.0)
 
 
 @dataclass(frozen=True)
@@ -110,11 +103,10 @@ def _reduced(ratio: float) -> int:
 
 
 class VisualOdometry:
-    """Follows the floor from a key frame to the newest frame; answers once the robot has moved enough to tell."""
+    """Follows the floor from a key frame to the newest frame; answers once the robot has moved enough to measure."""
 
-    def __init__(self, geometry: CameraGeometry, config: VisualConfig | None = None) -> None:
+    def __init__(self, geometry: CameraGeometry) -> None:
         self._geometry = geometry
-        self._config = config or VisualConfig()
         self._projector: FloorProjector | None = None
         self._shape = (0, 0)
         self._previous: Grey | None = None
@@ -123,8 +115,8 @@ class VisualOdometry:
         self._tracked: Array = np.zeros((0, 2))
         self._rng = np.random.default_rng(0)
         self.tilt_rad = 0.0
-        """How much further down than told the camera looks, as learned so far."""
-        self._tilt_variance = self._config.tilt_sigma_rad**2
+        """Learned error of the camera's pitch, rad: how much further down it points than its geometry states."""
+        self._tilt_variance = TILT_SIGMA_RAD**2
         self.refused = 0
         """Frames on which the floor could not be followed any more."""
 
@@ -146,7 +138,7 @@ class VisualOdometry:
         attitude = replace(attitude, pitch_rad=attitude.pitch_rad + self.tilt_rad)
         motion: VisualMotion | None = None
         restart = True
-        if self._key is not None and stamp_ns - self._previous_ns <= self._config.max_gap_ns and self._follow(grey):
+        if self._key is not None and stamp_ns - self._previous_ns <= MAX_GAP_NS and self._follow(grey):
             solved = self._solve(self._projector, self._key, attitude)
             if solved is None:
                 self.refused += 1
@@ -162,33 +154,23 @@ class VisualOdometry:
         return motion
 
     def _due(self, solved: Solution, key: _Keyframe, stamp_ns: int) -> bool:
-        config = self._config
         return (
-            math.hypot(solved.unknowns[0], solved.unknowns[1]) >= config.keyframe_distance_m
-            or abs(solved.unknowns[2]) >= config.keyframe_turn_rad
-            or stamp_ns - key.stamp_ns >= config.keyframe_age_ns
-            or solved.inliers < config.renew_corners
+            math.hypot(solved.unknowns[0], solved.unknowns[1]) >= KEYFRAME_DISTANCE_M
+            or abs(solved.unknowns[2]) >= KEYFRAME_TURN_RAD
+            or stamp_ns - key.stamp_ns >= KEYFRAME_AGE_NS
+            or solved.inliers < RENEW_CORNERS
         )
 
     def _answer(
         self, projector: FloorProjector, key: _Keyframe, grey: Grey, stamp_ns: int, attitude: Attitude, solved: Solution
     ) -> VisualMotion:
         """The motion by the whole picture; by its corners where that does not settle near them."""
-        config = self._config.alignment
-        now = smooth(grey, config)
         aligned = align_pictures(
-            projector,
-            key.picture,
-            key.attitude,
-            now,
-            attitude,
-            solved.unknowns,
-            key.floor,
-            config,
+            projector, key.picture, key.attitude, smooth(grey), attitude, solved.unknowns, key.floor
         )
-        if aligned is not None and aligned.share >= config.min_share:
+        if aligned is not None and aligned.share >= MIN_SHARE:
             apart = np.abs(aligned.unknowns[:3] - solved.unknowns[:3])
-            if apart[:2].max() < config.settle_m and apart[2] < config.settle_rad:
+            if apart[:2].max() < SETTLE_M and apart[2] < SETTLE_RAD:
                 solved = aligned
                 self._learn_tilt(aligned)
         x, y, theta = (float(v) for v in solved.unknowns[:3])
@@ -197,24 +179,23 @@ class VisualOdometry:
         return VisualMotion(key.stamp_ns, stamp_ns, SE2(x, y, theta), covariance, solved.inliers)
 
     def _learn_tilt(self, aligned: Solution) -> None:
-        """What near and far floor agree on best is how the camera really looks down: mounting, attitude and lens."""
-        config = self._config
-        gain = self._tilt_variance / (self._tilt_variance + (config.tilt_caution * aligned.tilt_sigma_rad) ** 2)
+        """Learn the camera's pitch from what near and far floor agree on best: mounting, attitude and lens."""
+        gain = self._tilt_variance / (self._tilt_variance + (TILT_CAUTION * aligned.tilt_sigma_rad) ** 2)
         learned = self.tilt_rad + gain * aligned.tilt_rad
-        self.tilt_rad = min(max(learned, -config.max_tilt_rad), config.max_tilt_rad)
-        self._tilt_variance = max((1.0 - gain) * self._tilt_variance, config.tilt_floor_rad**2)
+        self.tilt_rad = min(max(learned, -MAX_TILT_RAD), MAX_TILT_RAD)
+        self._tilt_variance = max((1.0 - gain) * self._tilt_variance, TILT_FLOOR_RAD**2)
 
     def _set_keyframe(self, projector: FloorProjector, grey: Grey, stamp_ns: int, attitude: Attitude) -> None:
         self._key, self._tracked = None, np.zeros((0, 2))
-        if grey[::4, ::4].mean() < self._config.min_brightness:
+        if grey[::4, ::4].mean() < MIN_BRIGHTNESS:
             return
         floor = self._floor_mask(projector, attitude)
-        found = cv2.goodFeaturesToTrack(grey, self._config.max_corners, 0.005, 5, mask=floor, blockSize=5)
-        if found is None or len(found) < self._config.min_corners:
+        found = cv2.goodFeaturesToTrack(grey, MAX_CORNERS, 0.005, 5, mask=floor, blockSize=5)
+        if found is None or len(found) < MIN_CORNERS:
             return
         corners = found.reshape(-1, 2).astype(np.float64)
         self._key, self._tracked = (
-            _Keyframe(stamp_ns, attitude, corners, smooth(grey, self._config.alignment), floor),
+            _Keyframe(stamp_ns, attitude, corners, smooth(grey), floor),
             corners,
         )
 
@@ -228,7 +209,7 @@ class VisualOdometry:
         for index, column in enumerate(columns):
             pixels = np.stack((np.full(height, column), rows), axis=1)
             _, depression = projector.floor_points(pixels, attitude)
-            below = np.flatnonzero(depression >= self._config.min_depression_rad)
+            below = np.flatnonzero(depression >= MIN_DEPRESSION_RAD)
             first[index] = below[0] if len(below) else height
         edge = np.interp(np.arange(width), columns, first)
         mask[rows[:, None] >= edge[None, :]] = 255
@@ -248,7 +229,7 @@ class VisualOdometry:
         at = after.reshape(-1, 2)
         inside = (at[:, 0] > 3) & (at[:, 0] < width - 4) & (at[:, 1] > 3) & (at[:, 1] < height - 4)
         good = (ok.ravel() == 1) & (ok_back.ravel() == 1) & (apart < 0.7) & inside
-        if np.count_nonzero(good) < self._config.min_corners:
+        if np.count_nonzero(good) < MIN_CORNERS:
             return False
         self._tracked = at[good].astype(np.float64)
         self._key = replace(self._key, corners=self._key.corners[good])
@@ -256,17 +237,16 @@ class VisualOdometry:
 
     def _solve(self, projector: FloorProjector, key: _Keyframe, attitude: Attitude) -> Solution | None:
         """The motion since the key frame by its corners."""
-        config = self._config
         before, _ = projector.floor_points(key.corners, key.attitude)
         after, depression = projector.floor_points(self._tracked, attitude)
-        usable = depression > config.min_depression_rad / 2
-        if np.count_nonzero(usable) < config.min_corners:
+        usable = depression > MIN_DEPRESSION_RAD / 2
+        if np.count_nonzero(usable) < MIN_CORNERS:
             return None
         start = self._vote(projector, before, after, usable, attitude)
         if start is None:
             return None
-        solved = fit_corners(projector, before, self._tracked, attitude, start, config.alignment)
-        if solved is None or solved.inliers < config.min_corners or solved.share < config.min_inlier_share:
+        solved = fit_corners(projector, before, self._tracked, attitude, start)
+        if solved is None or solved.inliers < MIN_CORNERS or solved.share < MIN_INLIER_SHARE:
             return None
         return solved
 
@@ -275,7 +255,7 @@ class VisualOdometry:
     ) -> Array | None:
         """The planar motion (x, y, θ) that most corners agree with, out of those that two corners each define."""
         indices = np.flatnonzero(usable)
-        pairs = self._rng.choice(indices, (self._config.hypotheses, 2))
+        pairs = self._rng.choice(indices, (HYPOTHESES, 2))
         p, q = before[pairs], after[pairs]
         dp, dq = p[:, 1] - p[:, 0], q[:, 1] - q[:, 0]
         apart = np.hypot(dp[:, 0], dp[:, 1]) > 0.2
@@ -291,9 +271,9 @@ class VisualOdometry:
         motions = np.concatenate((shift, turn[:, None]), axis=1)
         moved = seen_from(before[None], motions[:, None, :])
         errors = np.abs(projector.pixels(moved, attitude) - self._tracked[None]).max(axis=2)
-        votes = np.count_nonzero(errors < 2 * self._config.alignment.inlier_px, axis=1)
+        votes = np.count_nonzero(errors < 2 * INLIER_PX, axis=1)
         best = int(votes.argmax())
-        if votes[best] < max(self._config.min_corners, self._config.min_inlier_share * len(before)):
+        if votes[best] < max(MIN_CORNERS, MIN_INLIER_SHARE * len(before)):
             return None
         return np.asarray(motions[best], dtype=np.float64)
 

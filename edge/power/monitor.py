@@ -19,8 +19,8 @@ from edge.power.meters.battery import BatteryReading, ReadBattery
 from edge.power.meters.meter import MEASURED, MODELLED, MeterError, PowerMeter, PowerSample
 from edge.power.meters.overcurrent import OverCurrentEvents
 from edge.power.meters.thermal import ThermalReader, ThermalState
+from edge.reasoning.generation_cycle import ReasoningBudget
 from edge.safety.faults.findings import Finding
-from edge.state.reasoning_budget import ReasoningBudget
 
 PERIOD_S: Final = 0.1
 STALE_NS: Final = 500_000_000

@@ -3,7 +3,7 @@
 Three rules, all off with `--decoding free`, the paper's greedy decoding:
 
 * Progress: the number of turns stays, a turn is followed by itself or by the next one, and a turn is undone only when
-  the model says so twice in a row.
+  the model chooses so twice in a row.
 * Turn distance: the planned turn is no further away than the median of the last observations of it, each less what the
   robot has driven since.
 * Turn done: a turn to a side is done once odometry has seen the robot rotate to that side.
@@ -303,7 +303,7 @@ class TurnEstimator:
         self, progress: Progress | None, turn: TurnObservation | None, anchor: EncodedFrame, *, overruled: bool,
         claimed: bool,
     ) -> None:  # fmt: skip
-        """Take what a text about the frame `anchor` says; a text without a turn ends the observations.
+        """Take what a text about the frame `anchor` gives; a text without a turn ends the observations.
 
         `overruled`: the model chose another progress, or the text was cut short, so its plan is unknown; `claimed`: it
         named a turn as done that cannot be.

@@ -14,10 +14,9 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import Final
 
 from edge.core.geometry import SE2
-from edge.reasoning.sync_halt import seen_standing
-from edge.state.reasoning_budget import UNLIMITED, ReasoningBudget
 from edge.state.switches import Decoding
 
 SYNC_DRIVE_S = 0.5
@@ -27,6 +26,32 @@ RETRY_S = 0.5
 FAILURES = 5
 FAILURE_WINDOW_S = 60.0
 """Fault matrix row 18: `FAILURES` failed generations within this time end reasoning until the next start, s."""
+STANDS_MPS = 0.1
+STANDS_RADPS = 0.2
+"""Speeds below which a robot stands. A simulated Go2 that steps on the spot stays within 2 cm."""
+SETTLE_S = 1.0
+"""Time after the halt from which the robot counts as standing, s. In simulation a Go2 needed 0.4 to 0.6 s."""
+
+
+@dataclass(frozen=True)
+class ReasoningBudget:
+    """What is allowed from the next generation on; control is never part of it."""
+
+    allowed: bool = True
+    """False: no generation is started, and one under way is cancelled."""
+    pause_s: float = 0.0
+    """Rest between two generations."""
+    max_new_tokens: int | None = None
+    """Cap below the artifacts' own; None: no other cap."""
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.pause_s) and self.pause_s >= 0):
+            raise ValueError(f"pause_s must be 0 or more, found {self.pause_s}")
+        if self.max_new_tokens is not None and self.max_new_tokens < 0:
+            raise ValueError(f"max_new_tokens must be 0 or more, found {self.max_new_tokens}")
+
+
+UNLIMITED: Final = ReasoningBudget()
 
 
 class Mode(Enum):
@@ -160,6 +185,30 @@ class _Phase(Enum):
     IDLE = "idle"
     RUNNING = "running"
     HELD = "held"
+
+
+def seen_standing(frames: Sequence[tuple[int, SE2]], halted_ns: int | None) -> bool:
+    """Whether a generation may begin with the newest of these frames: a robot that was halted still coasts.
+
+    What it sees then is not what it sees from where it will start to drive (paper, appendix D).
+
+    `frames`: stamp, ns, and pose `T_odom_base` of the newest ones, oldest first; `halted_ns`: when the robot was told
+    to stand, None in a mode that drives on. The speed is the mean between the newest two.
+    """
+    if not frames:
+        return False
+    if halted_ns is None:
+        return True
+    stamp_ns, T_odom_base = frames[-1]
+    if stamp_ns < halted_ns:
+        return False  # no frame since the halt
+    if stamp_ns - halted_ns >= SETTLE_S * 1e9:
+        return True
+    if len(frames) < 2:
+        return False
+    before_ns, T_odom_before = frames[-2]
+    moved, seconds = T_odom_before.inverse() @ T_odom_base, (stamp_ns - before_ns) / 1e9
+    return math.hypot(moved.x_m, moved.y_m) < STANDS_MPS * seconds and abs(moved.theta_rad) < STANDS_RADPS * seconds
 
 
 class GenerationCycle:

@@ -1,7 +1,7 @@
-"""The way since an instruction began, in few points: what a language model that sees 9 s knows of the minutes before.
+"""The path since an instruction began, in few points: a language model that sees 9 s is given the minutes before.
 
 The paper's "historical trajectory" (appendix B) for instructions that count turns and doors: odometry poses about 1 s
-apart, simplified by splitting at the farthest point (Ramer, Douglas and Peucker), told in the newest robot frame.
+apart, simplified by splitting at the farthest point (Ramer, Douglas and Peucker), given in the newest robot frame.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ Way: TypeAlias = tuple[Point, ...]
 
 MAX_POINTS = 8
 TOLERANCE_M = 0.5
-"""Of a way that is told: passing people bends it by less, a turn into a corridor or a room by more."""
+"""Tolerance of a path in a prompt: passing people bends it by less, a turn into a corridor or a room by more."""
 PERIOD_NS = 1_000_000_000
 """Between two poses that are kept."""
 MOVED_M = 0.1
 """A robot that stands keeps no new pose."""
 FARTHEST_M = 999.9
-"""Beyond this a coordinate is told as this, so that a prompt's length has a bound."""
+"""Largest coordinate that a prompt gives, m, so that its length has a bound."""
 CAPACITY = 512
 """Poses kept, more than 8 minutes of driving; then half of them go, those that the way's form needs least."""
 
@@ -36,7 +36,7 @@ CAPACITY = 512
 def simplified(points: Sequence[Point], most: int, tolerance_m: float) -> list[Point]:
     """At most `most` (2 or more) of the points, in their order: always the first and the last.
 
-    The farthest point from what is told so far comes next, until none is farther than the tolerance, m. Deterministic:
+    The farthest point from those chosen so far comes next, until none is farther than the tolerance, m. Deterministic:
     of equally far points the oldest.
     """
     return [points[i] for i in _kept(points, most, tolerance_m)]
@@ -51,19 +51,19 @@ def _kept(points: Sequence[Point], most: int, tolerance_m: float) -> list[int]:
     kept = [0, len(points) - 1]
     waiting: list[tuple[float, int, int, int]] = []
 
-    def look(first: int, last: int) -> None:
+    def split_at_farthest(first: int, last: int) -> None:
         if last - first > 1:
             far_m = _distances(xy[first + 1 : last], xy[first], xy[last])
             index = int(np.argmax(far_m))
             if far_m[index] > tolerance_m:
                 heapq.heappush(waiting, (-float(far_m[index]), first + 1 + index, first, last))
 
-    look(*kept)
+    split_at_farthest(*kept)
     while waiting and len(kept) < most:
         _, split, first, last = heapq.heappop(waiting)
         kept.append(split)
-        look(first, split)
-        look(split, last)
+        split_at_farthest(first, split)
+        split_at_farthest(split, last)
     return sorted(kept)
 
 
@@ -73,7 +73,7 @@ def _distances(
     """Distance of points [N, 2] to the segment from a to b, m: to the segment, for a way may go out and back."""
     along = b - a
     square = float(along @ along)
-    # Nothing to be along: a segment shorter than any odometry tells.
+    # A segment shorter than any odometry resolves has no direction.
     share = np.clip((xy - a) @ along / square, 0.0, 1.0) if square > 1e-12 else np.zeros(len(xy))
     apart = xy - a - share[:, None] * along
     distances: npt.NDArray[np.float64] = np.hypot(apart[:, 0], apart[:, 1])
@@ -120,14 +120,14 @@ class PathMemory:
     def way(self, T_odom_base: SE2) -> Way:
         """The way up to a pose, which is the newest, in that robot frame; () while no pose was seen."""
         here = (T_odom_base.x_m, T_odom_base.y_m)
-        # One more than is told: the end is the robot's own place.
-        told = simplified([*self._points, here], MAX_POINTS + 1, TOLERANCE_M)[:-1]
+        # One more than the prompt gets: the last is the robot's own place.
+        chosen = simplified([*self._points, here], MAX_POINTS + 1, TOLERANCE_M)[:-1]
         T_base_odom = T_odom_base.inverse()
-        return tuple(told_point(T_base_odom @ SE2(x, y, 0.0)) for x, y in told)
+        return tuple(prompt_point(T_base_odom @ SE2(x, y, 0.0)) for x, y in chosen)
 
 
-def told_point(T_base_point: SE2) -> Point:
-    """A place in the robot's frame as a prompt tells it: 0.1 m, without a negative zero, of a bounded length."""
+def prompt_point(T_base_point: SE2) -> Point:
+    """A place in the robot's frame as a prompt gives it: to 0.1 m, without a negative zero, of a bounded length."""
     x_m, y_m = (
         round(min(max(value, -FARTHEST_M), FARTHEST_M), 1) + 0.0 for value in (T_base_point.x_m, T_base_point.y_m)
     )
@@ -135,7 +135,7 @@ def told_point(T_base_point: SE2) -> Point:
 
 
 def way_of(poses: Iterable[tuple[int, SE2]]) -> Way:
-    """The way of (stamp ns, `T_odom_base`) since an instruction began, oldest first, as told at the last of them."""
+    """The way of (stamp ns, `T_odom_base`) since an instruction began, oldest first, as seen from the last of them."""
     memory = PathMemory()
     newest: SE2 | None = None
     for stamp_ns, newest in poses:

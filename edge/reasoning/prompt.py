@@ -94,18 +94,18 @@ class PromptBuilder:
         return Segment((*head, *self._text(f"Frame {number}:"), *image, *self._text("\n")), frame.tokens)
 
     def tail(self, way: Way, before: Progress | None) -> Segment:
-        """What follows the frames: the way since the instruction began as told at the newest of them, the progress that
-        the generation before said (None: none has), and the assistant's turn."""
+        """What follows the frames: the path since the instruction began, in the frame of the newest of them, the
+        progress of the text before (None: no such), and the assistant's turn."""
         ids = self._ids
-        text = [*self._text(f"Past motion: {past_motion(way)}\nBefore: {told_before(before)}"), ids.im_end]
+        text = [*self._text(f"Past motion: {format_past_motion(way)}\nBefore: {format_before(before)}"), ids.im_end]
         return Segment((*text, *self._text("\n"), ids.im_start, *self._text("assistant\n")), None)
 
 
-def past_motion(way: Way) -> str:
+def format_past_motion(way: Way) -> str:
     """Where the robot has been, in its own frame now: "(-1.4, 0.0) (0.0, 2.1)" in m, oldest first."""
     return " ".join(f"({x_m:.1f}, {y_m:.1f})" for x_m, y_m in way) or "none"
 
 
-def told_before(before: Progress | None) -> str:
-    """What the generation before said of progress, in the canonical words alone: its text is untrusted."""
+def format_before(before: Progress | None) -> str:
+    """Progress of the text before, in canonical form alone: that text is untrusted."""
     return "none." if before is None else format_progress(before)

@@ -65,20 +65,20 @@ class _Gate:
         self._clock = clock
         self._say = say
         self._since_ns: int | None = None
-        self._said = ""
+        self._reported = ""
         self.why = ""
 
-    def look(self, status: BridgeStatus | None) -> bool:
-        """One look. Raises RefusedError when it is in the way for long and somebody wants the robot to be armed."""
+    def is_clear(self, status: BridgeStatus | None) -> bool:
+        """Check once. Raises RefusedError when it stays in the way although the robot may be armed."""
         now_ns, self.why = self._clock(), self._in_the_way()
         permitted = not self._operator or (status is not None and status.blocked_by == "none")
         if not self.why or not permitted or self._since_ns is None:
             self._since_ns = now_ns
         elif now_ns - self._since_ns > LASTS_S * 1e9:
-            # An operator's word is not kept for later: the robot would start when nobody expects it.
+            # An operator's permission is not kept for later: the robot would start unexpectedly.
             raise RefusedError(f"not armed: {self.why}")
-        if self.why and self.why != self._said:
-            self._said = self.why
+        if self.why and self.why != self._reported:
+            self._reported = self.why
             self._say(f"not armed yet: {self.why}")
         return not self.why
 
@@ -98,12 +98,12 @@ def arm(
     """Arm, and keep the bridge fed with zeros until it has the robot on its feet; the last sequence number used.
 
     `limit_s`: for the arming itself; waiting for an operator has no limit. `on_wait(WAITING or ARMING)`: every 50 ms
-    from when that waiting began. `in_the_way()`: what would keep the robot from driving, looked at every 50 ms and
+    from when that waiting began. `in_the_way()`: what would keep the robot from driving, checked every 50 ms and
     empty when the bridge is asked; for an `operator` it is waited for as long as there is none. Raises RefusedError,
     StoppedEarlyError or BridgeUnavailable.
     """
     gate = _Gate(in_the_way, operator, clock, say)
-    while not gate.look(bridge.poll()):
+    while not gate.is_clear(bridge.poll()):
         if stop_requested():
             raise StoppedEarlyError("stopped before the robot was armed")
         if operator:
@@ -131,7 +131,7 @@ def arm(
         if stop_requested():
             raise StoppedEarlyError("stopped while waiting to be armed" if waits else "stopped while arming")
         passed_s = (clock() - asked_ns) / 1e9
-        clear = not waits or gate.look(status)
+        clear = not waits or gate.is_clear(status)
         if waits and clear and passed_s >= ASK_AGAIN_S:
             asked_ns, begun = _ask(bridge, clock), False
         elif not waits and passed_s > limit_s:
@@ -155,7 +155,7 @@ def disarm(
         try:
             status = bridge.poll()
         except BridgeUnavailable:
-            return False  # the end of the connection stops the robot, but nobody confirms it
+            return False  # the end of the connection stops the robot, but nothing confirms it
         stopped = status is not None and status.stamp_ns >= asked_ns and status.state in ("stopped", "disarmed")
         if status is not None and stopped and status.zero_after_stop and status.motion == "still":
             return True

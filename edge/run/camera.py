@@ -46,7 +46,7 @@ class CameraPoller:
     ) -> None:
         """`on_frame` is given every frame in the camera thread, after the control thread may see it.
 
-        `on_death` is told, once and in that thread, why it has ended although nobody closed it.
+        `on_death` takes, once and in that thread, why it has ended although it was not closed.
         """
         self._request = request
         self._on_frame = on_frame
@@ -97,8 +97,8 @@ class CameraPoller:
                 self.last_error = str(error)
                 continue
             # The protocol carries no capture stamp: the answer's arrival less the camera's latency, and never before
-            # the request, since both known robots sample when asked. Of an answer that took much longer nobody knows
-            # when it was captured: as long ago as it can have been.
+            # the request, since both known robots sample when asked. When an answer took much longer, its capture is
+            # unknown: as long ago as it can have been.
             slow = arrived_ns - requested_ns > self._latency_ns + self._period_ns
             stamp_ns = requested_ns if slow else max(requested_ns, arrived_ns - self._latency_ns)
             self.newest = frame = Frame(stamp_ns, pixels, jpeg)

@@ -33,7 +33,7 @@ from firmware_bridge.client import BridgeStatus
 
 BRIDGE_SILENCE_NS = 500_000_000
 """Silence of the bridge after which it counts as hung and the run ends, ns; it reports at 10 Hz."""
-GLANCE_S = 0.01
+URGENT_POLL_S = 0.01
 """Period at which the waiting control thread polls for urgent faults, s."""
 THINKING = "thinking"
 """Reason for standing in sync mode while a generation is under way."""
@@ -281,7 +281,7 @@ class ControlLoop:
             self._recorder.put("/tick", start_ns, record)
         return command
 
-    def glance(self) -> bool:
+    def poll_urgent_faults(self) -> bool:
         """Between ticks: act on urgent faults; returns whether they stopped the robot."""
         findings = self._watch.urgent()
         if not findings:
@@ -297,20 +297,20 @@ class ControlLoop:
         """True when `stop` was set meanwhile; returns early when the supervisor has stopped the run."""
         while True:
             left_s = max(0, deadline_ns - self._clock()) / 1e9
-            if self._stop.wait(min(left_s, GLANCE_S)):
+            if self._stop.wait(min(left_s, URGENT_POLL_S)):
                 return True
-            if left_s <= GLANCE_S:
+            if left_s <= URGENT_POLL_S:
                 return False
-            self.glance()
+            self.poll_urgent_faults()
             if self.supervision.stop:
                 return False
 
     def _supervise(self, findings: tuple[Finding, ...], now_ns: int) -> None:
         self.supervision = self._supervisor.step(SupervisorInputs(findings, armed=True), now_ns)
         for event in self.supervision.events:
-            self._tell(event)
+            self._report(event)
 
-    def _tell(self, event: FaultEvent) -> None:
+    def _report(self, event: FaultEvent) -> None:
         fault = event.fault
         if event.raised:
             self.statistics.faults[fault.name] = self.statistics.faults.get(fault.name, 0) + 1

@@ -114,7 +114,7 @@ def parse(data: bytes) -> str:
 
 
 def _answers(path: Path) -> bool:
-    """Whether somebody holds this socket open."""
+    """Whether a process holds this socket open."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(str(path))

@@ -18,6 +18,7 @@ from edge.inference.graph import CancelledError, Interrupt
 from edge.inference.scheduling import REASONING_NICENESS, GiveWay, Role, enter
 from edge.reasoning.anchor import Anchor, older_frames
 from edge.reasoning.generation_cycle import (
+    UNLIMITED,
     Action,
     Anchored,
     Cancelled,
@@ -29,15 +30,15 @@ from edge.reasoning.generation_cycle import (
     FrameMissed,
     GenerationCycle,
     Mode,
+    ReasoningBudget,
     ReasoningConfig,
 )
 from edge.reasoning.instruction_state import InstructionMemory, Job
-from edge.state.reasoning_budget import UNLIMITED, ReasoningBudget
 from edge.state.ring import EncodedFrame
 from edge.state.semantic import SemanticState, SharedState
 
 IDLE_S = 0.02
-"""Pause between two looks for work, and between two checks of a result that is held back, s."""
+"""Pause between two checks for work, and between two checks of a result that is held back, s."""
 FRAME_POLL_S = 0.002
 """Period at which a generation looks for its newest frame after prefilling the older ones, s."""
 ANCHOR_MARGIN_NS = 1_000_000_000

@@ -19,7 +19,7 @@ from firmware_bridge.core.config import RobotConfig
 
 
 def run_record(artifacts: Artifacts, robot: RobotConfig, options: RunOptions, started_ns: int) -> dict[str, Any]:
-    """What the flight log says of a run at its begin."""
+    """Record of a run's start in the flight log."""
     delay = options.release_delay
     return {
         "instruction": options.instruction,

@@ -1,7 +1,7 @@
 """What the runner knows of the robot: its reports through the drift estimator into the pose history, and its camera.
 
-Reports are taken in the thread that reads them, pictures in the camera's; the control thread only looks at what they
-leave behind.
+Reports are taken in the thread that reads them, pictures in the camera's; the control thread only reads the
+results.
 """
 
 from __future__ import annotations
@@ -19,18 +19,38 @@ from edge.flightlog.recorder import Recorder
 from edge.flightlog.records import Throttle, battery_record, odometry_record
 from edge.odometry.calibration import OdometryCalibration, load_calibration
 from edge.odometry.camera_geometry import Attitude, CameraGeometry
-from edge.odometry.estimator import DriftEstimator, OdometryInputs, OdometryOutputs
+from edge.odometry.estimator import DriftEstimator, OdometryOutputs
+from edge.odometry.gate import OdometryInputs
 from edge.odometry.visual_odometry import VisualOdometry, grey_frame
 from edge.run.camera import CameraPoller
 from edge.safety.faults.findings import FindingQueue
 from edge.safety.monitors.robot import LinkMonitor
 from edge.state.frame import Frame
 from edge.state.pose_history import PoseHistory
+from firmware_bridge.client import BridgeClient, BridgeStatus
 from firmware_bridge.core.config import RobotConfig
 from firmware_bridge.unitree.client import BatteryState, Go2Reader, RobotState
 
 ODOMETRY_LOG_HZ = 50.0
 BATTERY_LOG_HZ = 1.0
+
+
+class CommandTap:
+    """Keeps the velocity in force on its way to the bridge; any thread may read `commanded`."""
+
+    def __init__(self, bridge: BridgeClient) -> None:
+        self._bridge = bridge
+        self.commanded: tuple[float, float, float] | None = None
+        """(vx m/s, vy m/s, ωz rad/s) sent last; None before the first."""
+
+    def send_velocity(self, seq: int, stamp_ns: int, vx_mps: float, vy_mps: float, wz_radps: float) -> bool:
+        """See `BridgeClient`."""
+        self.commanded = (vx_mps, vy_mps, wz_radps)
+        return self._bridge.send_velocity(seq, stamp_ns, vx_mps, vy_mps, wz_radps)
+
+    def poll(self) -> BridgeStatus | None:
+        """See `BridgeClient`."""
+        return self._bridge.poll()
 
 
 class RobotInputs:
@@ -48,7 +68,7 @@ class RobotInputs:
     ) -> None:
         """`commanded`: the velocity in force now; it must not wait.
 
-        `on_death` is told why the thread of the reports or of the pictures has ended, in that thread.
+        `on_death` takes why the thread of the reports or of the pictures has ended, in that thread.
         """
         file = robot.odometry.calibration
         self.estimator = DriftEstimator(_calibration(file))
@@ -87,7 +107,7 @@ class RobotInputs:
 
     @property
     def odometry(self) -> OdometryOutputs | None:
-        """What the drift estimator said last."""
+        """Last outputs of the drift estimator."""
         return self._newest
 
     def offset_covariance(self, anchor_ns: int) -> npt.NDArray[np.float64] | None:

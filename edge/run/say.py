@@ -66,7 +66,8 @@ def stop_robot(path: Path, bridge: Path | None = None) -> int:
     """
     from firmware_bridge.operate import operate
 
-    bridges = [bridge] if bridge else [each for each in (SERVICE_SOCKET, _default_bridge()) if not _is_absent(each)]
+    defaults = (SERVICE_SOCKET, runtime_dir() / ROBOT_FILE_SOCKET)
+    bridges = [bridge] if bridge else [each for each in defaults if not _is_absent(each)]
     with contextlib.ExitStack() as stack:
         try:
             asking: socket.socket | None = stack.enter_context(_question(path, STOP))
@@ -128,12 +129,8 @@ def _stop_answer(asking: socket.socket, path: Path) -> dict[str, Any] | None:
     return None
 
 
-def _default_bridge() -> Path:
-    return runtime_dir() / ROBOT_FILE_SOCKET
-
-
 def _is_absent(bridge: Path) -> bool:
-    """Whether there is certainly no bridge; one that this user cannot look at counts as present."""
+    """Whether there is certainly no bridge; one that this user cannot see counts as present."""
     try:
         Path(f"{bridge}{OPERATOR_SUFFIX}").lstat()
     except (FileNotFoundError, NotADirectoryError):

@@ -1,18 +1,22 @@
-"""The runner as a service: ready, a status line, watchdog, stopping; nothing without systemd.
+"""The runner as a service (ready, a status line, watchdog, stopping; nothing without systemd), and its lines.
 
 Ready is a runner that drives on time, or one that waits for an operator who may take hours.
 """
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
-from typing import Final
+from typing import Final, TextIO, cast
 
 from edge.safety.watchdog import WatchdogFeeder
+from firmware_bridge.line_log import LineLog
 from firmware_bridge.notify import Notifier
 
 STATUS_PERIOD_NS: Final = 5_000_000_000
+CAPACITY: Final = 512
+"""Lines for the operator that wait to be written."""
 
 
 class ServiceReporter:
@@ -21,7 +25,7 @@ class ServiceReporter:
     Order of use: `starting` before each long step of start-up, `on_wait` while the runner waits for an operator and
     until it drives, `on_tick` from the control thread after every tick, `stopping` once. Ready is said when the control
     thread has been on time for a whole window or the waiting begins, so what systemd counts as started is a runner that
-    drives, or will do so when somebody says it may.
+    drives, or will do so when an operator permits it.
     """
 
     def __init__(
@@ -32,13 +36,13 @@ class ServiceReporter:
         describe: Callable[[], str],
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`describe()`: the status line's text, a few words; called in the control thread, so it must not wait."""
+        """`describe()`: the status line's text, short; called in the control thread, so it must not wait."""
         self._notifier = notifier
         self._feeder = WatchdogFeeder(ping_period_ns=notifier.watchdog_period_ns, tick_period_ns=tick_period_ns)
         self._describe = describe
         self._clock = clock
         self._ready = False
-        self._said_ns: int | None = None
+        self._status_ns: int | None = None
         self._fed_ns = 0
         self._waited = ""
 
@@ -73,10 +77,32 @@ class ServiceReporter:
             return
         if ping:
             self._notifier.watchdog()
-        if self._said_ns is None or now_ns - self._said_ns >= STATUS_PERIOD_NS:
-            self._said_ns = now_ns
+        if self._status_ns is None or now_ns - self._status_ns >= STATUS_PERIOD_NS:
+            self._status_ns = now_ns
             self._notifier.status(self._describe())
 
     def stopping(self, text: str) -> None:
         """The run ends, by itself, by a fault or on request."""
         self._notifier.stopping(text)
+
+
+class Descriptor:
+    """What `LineLog` writes to. No buffer, so no lock that a blocked write would keep until the interpreter's end."""
+
+    def __init__(self, number: int) -> None:
+        self._number = number
+
+    def write(self, text: str) -> int:
+        """Write all of it, however long the reader takes; raises OSError."""
+        data = memoryview(text.encode("utf-8", "backslashreplace"))
+        while data:
+            data = data[os.write(self._number, data) :]
+        return len(text)
+
+    def flush(self) -> None:
+        """Nothing is kept back."""
+
+
+def operator_lines(prefix: str, descriptor: int = 2) -> LineLog:
+    """Lines to standard error: a pager that is not read or a pipe that broke delays and ends nothing."""
+    return LineLog(cast(TextIO, Descriptor(descriptor)), prefix, capacity=CAPACITY)

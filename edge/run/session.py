@@ -24,10 +24,9 @@ from edge.reasoning.generation_cycle import Mode
 from edge.reasoning.prompt import InstructionError
 from edge.run.arming import POLL_S, RefusedError, StoppedEarlyError, arm, disarm
 from edge.run.assembly import Engines, Loops, RunOptions, assemble
-from edge.run.command_tap import CommandTap
 from edge.run.instructions import InstructionSocket
 from edge.run.result import run_record, run_result
-from edge.run.robot_inputs import RobotInputs
+from edge.run.robot_inputs import CommandTap, RobotInputs
 from edge.run.service import ServiceReporter
 from edge.safety.faults.findings import Finding
 from edge.safety.faults.table import FAULTS
@@ -46,8 +45,9 @@ END_S = 7.0
 JOIN_S = 3.0
 """Of it, the most for both loops' threads: a call of a graph is interrupted."""
 STOP_CONFIRM_S = 1.0
-STANDSTILL_S = 2.0  # for the robot to come to rest and report it
-"""Of it, the most for the bridge's word that the robot has been told to stand."""
+"""Of it, the most until the bridge confirms that it has sent zero velocity."""
+STANDSTILL_S = 2.0
+"""Time for the robot to come to rest and report it, s."""
 STOP_PHRASE = f"{FAULTS['stop-phrase'].says} {FAULTS['stop-phrase'].advice}"
 """Fault that ends a run when the instruction channel brings a stop phrase."""
 LINES = 200
@@ -86,17 +86,16 @@ class RunSession:
         activity = TickActivity(self._period_ns)
         policy = Policy(artifacts, schedule=self._schedule, activity=activity)
         language = LanguageModel(artifacts, schedule=self._schedule)
-        self._check_instruction(language, options.instruction)
+        language.check_instruction(options.instruction)
         try:
             tick_ms = warm_up(policy, language, runtime.image_px, len(runtime.frame_offsets_s))
         except (GraphError, ContextOverflowError) as error:
             raise ArtifactError(f"{artifacts.directory}: the graphs do not run ({error})") from error
         check_tick(artifacts, tick_ms)
         self._engines = Engines(artifacts, policy, language, self._schedule, activity)
-        self._stop = threading.Event()
+        self._stop, self._finished = threading.Event(), threading.Event()
         self._stop_requested = False
         self._faults: list[str] = []
-        self._finished = threading.Event()
         self._began = False
         self.hung = False
         """Whether reasoning hangs in a call that nothing but the end of the process ends."""
@@ -107,15 +106,12 @@ class RunSession:
         try:
             return InstructionSocket(
                 self._options.instructions,
-                check=lambda text: self._check_instruction(self._engines.language, text),
+                check=self._engines.language.check_instruction,
                 stop=lambda: self._stop_by_phrase(bridge),
                 bridge=self._robot.bridge.socket,
             )
         except OSError as error:
             raise RefusedError(str(error)) from error
-
-    def _check_instruction(self, language: LanguageModel, text: str) -> None:
-        language.check_instruction(text, len(self._artifacts.runtime.frame_offsets_s))
 
     def _stop_by_phrase(self, bridge: BridgeClient) -> bool:
         """Stop the robot and end the run; whether the bridge reports within STANDSTILL_S that it stands still."""
@@ -126,15 +122,14 @@ class RunSession:
         self._stop.set()
         return disarm(bridge, limit_s=STANDSTILL_S)
 
-    def _take_instructions(self, told: InstructionSocket | None, loops: Loops) -> None:
+    def _take_instructions(self, channel: InstructionSocket | None, loops: Loops) -> None:
         """Hand a new instruction on to reasoning; a stop phrase has stopped the robot when this returns."""
-        instruction = None if told is None else told.poll()
-        if instruction is not None:
+        if channel is not None and (instruction := channel.poll()) is not None:
             loops.reasoning.submit(instruction)
             self._print(f"new instruction: {instruction}")
 
     def request_stop(self) -> None:
-        """Ask for a clean end. Safe in a signal handler: it takes no lock, the main thread looks at it regularly."""
+        """Ask for a clean end. Safe in a signal handler: it takes no lock, the main thread polls it."""
         self._stop_requested = True
 
     def run(self) -> dict[str, Any]:
@@ -150,7 +145,7 @@ class RunSession:
         bridge = BridgeClient(self._robot.bridge.socket)
         inputs: RobotInputs | None = None
         recorder: Recorder | None = None
-        told: InstructionSocket | None = None
+        channel: InstructionSocket | None = None
         result: dict[str, Any] | None = None
         end: Deadline | None = None
         try:
@@ -180,14 +175,13 @@ class RunSession:
                 say=self._lines.append,
                 on_tick=self._reporter.on_tick,
             )
-            told = self._open_instructions(bridge)
+            channel = self._open_instructions(bridge)
             loops.power.start()
             # After everything that lives as long as the process has been made.
-            refused = lock_memory()
-            if refused is not None:
+            if (refused := lock_memory()) is not None:
                 self._lines.append(refused)
             freeze_garbage()
-            loops.control.last_seq = self._arm(bridge, loops, told)
+            loops.control.last_seq = self._arm(bridge, loops, channel)
             self._print(f"armed and driving {self._robot.name}: {self._options.instruction}")
             started_ns = time.monotonic_ns()
             process = psutil.Process()
@@ -196,7 +190,7 @@ class RunSession:
             if recorder is not None:
                 recorder.put("/run", started_ns, run_record(self._artifacts, self._robot, self._options, started_ns))
                 inputs.recorder = recorder
-            end = self._drive(loops, inputs, bridge, told)
+            end = self._drive(loops, inputs, bridge, channel)
             status = self._halt(bridge, end)
             result = run_result(
                 loops.control,
@@ -214,8 +208,8 @@ class RunSession:
         finally:
             # Whatever ended the run: closing the connection makes the bridge stop the robot.
             bridge.close()
-            if told is not None:
-                told.close()
+            if channel is not None:
+                channel.close()
             end = end or Deadline(END_S)
             if recorder is not None:
                 self._close_recorder(recorder, result, end)
@@ -261,15 +255,15 @@ class RunSession:
                     self._print(f"waiting for the robot: no {missing} yet, is it on?")
             time.sleep(POLL_S)
 
-    def _arm(self, bridge: BridgeClient, loops: Loops, told: InstructionSocket | None) -> int:
+    def _arm(self, bridge: BridgeClient, loops: Loops, channel: InstructionSocket | None) -> int:
         """Arm, after an operator where the robot file wants one; returns the last sequence number used.
 
         Raises RefusedError after a stop phrase, StoppedEarlyError after another request to stop.
         """
 
         def stop_requested() -> bool:
-            self._take_instructions(told, loops)
-            if told is not None and told.stopped:
+            self._take_instructions(channel, loops)
+            if channel is not None and channel.stopped:
                 raise RefusedError(f"not armed: {STOP_PHRASE}")
             return self._stop_requested
 
@@ -293,9 +287,9 @@ class RunSession:
         )
 
     def _drive(
-        self, loops: Loops, inputs: RobotInputs, bridge: BridgeClient, told: InstructionSocket | None
+        self, loops: Loops, inputs: RobotInputs, bridge: BridgeClient, channel: InstructionSocket | None
     ) -> Deadline:
-        """Run both threads until the end; this thread only waits and looks on. Returns by when all must have ended."""
+        """Run both threads until the end; this thread only waits and watches. Returns by when all must have ended."""
         # The bridge's deadman is already running: the first command must not wait for a whole period.
         epoch_ns = time.monotonic_ns() + self._period_ns // 2
         inputs.camera.align(epoch_ns - round(CAMERA_LEAD * self._period_ns))
@@ -321,7 +315,7 @@ class RunSession:
         ]
         for thread in threads:
             thread.start()
-        self._look_on(loops, inputs, told)
+        self._watch_run(loops, inputs, channel)
         self._stop.set()
         end = Deadline(END_S)
         reasoning.cancel()
@@ -335,7 +329,7 @@ class RunSession:
     def _guard(
         self, name: str, body: Callable[[], None], after: Callable[[], None] | None = None
     ) -> Callable[[], None]:
-        """The body of a thread whose end is the end of the run; `after` is told when the faults are known."""
+        """The body of a thread whose end is the end of the run; `after` is called when the faults are known."""
 
         def target() -> None:
             try:
@@ -351,7 +345,7 @@ class RunSession:
 
         return target
 
-    def _look_on(self, loops: Loops, inputs: RobotInputs, told: InstructionSocket | None) -> None:
+    def _watch_run(self, loops: Loops, inputs: RobotInputs, channel: InstructionSocket | None) -> None:
         """Until a thread has ended or a stop is asked for: hand on lines and instructions, watch over reasoning."""
         reasoning, says, watch = loops.reasoning, "", ReasoningWatch()
         while not self._finished.wait(POLL_S):
@@ -361,7 +355,7 @@ class RunSession:
                 says = loops.control.supervision.says
                 self._print(says or "all faults have cleared")
             self._print_lines()
-            self._take_instructions(told, loops)
+            self._take_instructions(channel, loops)
             hang = watch.step(
                 reasoning.last_progress_ns, reasoning.times.generation_ms.quantile(1.0), time.monotonic_ns()
             )

@@ -21,7 +21,7 @@ class StampedPose:
 
 
 class PoseHistory:
-    """The last `capacity` poses; one writer, any number of readers, nobody ever waits.
+    """The last `capacity` poses; one writer, any number of readers, none ever waits.
 
     Slots are replaced whole, and copying a list is atomic in CPython, so a reader sees complete poses only.
     """

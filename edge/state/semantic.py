@@ -47,7 +47,7 @@ class SemanticState:
     text: str
     waypoints: Waypoints | None
     text_complete: bool = True
-    """False: the mode or the power budget cut the text short, so that it says nothing about the model's health."""
+    """False: the mode or the power budget cut the text short, so that it is no sign of the model's health."""
     T_odom_stop: SE2 | None = None
     """Where this text and those before it plan to stop (`edge.reasoning.instruction_state`)."""
 

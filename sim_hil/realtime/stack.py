@@ -29,7 +29,7 @@ COMMANDS: Mapping[str, Sequence[str]] = {
     "edge-export": (sys.executable, "-m", "export.cli"),
     "edge-hil": (sys.executable, "-m", "sim_hil.hil.command"),
     "edge-bridge": (sys.executable, "-m", "firmware_bridge.bridge"),
-    "edge-run": (sys.executable, "-m", "edge.runner"),
+    "edge-run": (sys.executable, "-m", "edge.run.command"),
 }
 
 READY_TIMEOUT_S = 120.0

@@ -72,13 +72,21 @@ def robot(tmp_path: Path, dds_domain: int, artifacts_dir: Path) -> Iterator[Robo
 
 
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "edge.runner", *map(str, arguments)]
+    command = [sys.executable, "-m", "edge.run.command", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=90, cwd=REPOSITORY, check=False)
 
 
 def drive(robot: Robot, *more: object) -> Running:
     """Context in which edge-run is driving; the robot has been told to move."""
-    return running("edge.runner", *robot.arguments(*more), folder=robot.folder, ready="driving")
+    return running("edge.run.command", *robot.arguments(*more), folder=robot.folder, ready="driving")
+
+
+def check_zero_in_time(robot: Robot, since_ns: int, host: HostStall) -> None:
+    """The robot gets zero within the bound, and nothing but zero after that."""
+    after = [(stamp_ns, zero) for stamp_ns, zero in robot.moves() if stamp_ns >= since_ns]
+    zero_ns = next(stamp_ns for stamp_ns, zero in after if zero)
+    check_stop_latency(zero_ns - since_ns, STOP_BOUND_NS, since_ns, host)
+    assert all(zero for stamp_ns, zero in after if stamp_ns > zero_ns)
 
 
 def test_a_run_drives_the_robot_and_leaves_it_standing_still(robot: Robot) -> None:
@@ -122,10 +130,7 @@ def test_killed_while_driving_the_robot_gets_zero_within_300_ms(robot: Robot) ->
         killed_ns = time.monotonic_ns()
         runner.process.wait(5)
     time.sleep(1.0)
-    after = [(stamp_ns, zero) for stamp_ns, zero in robot.moves() if stamp_ns >= killed_ns]
-    zero_ns = next(stamp_ns for stamp_ns, zero in after if zero)
-    check_stop_latency(zero_ns - killed_ns, STOP_BOUND_NS, killed_ns, host)
-    assert all(zero for stamp_ns, zero in after if stamp_ns > zero_ns), "and nothing but zero after that"
+    check_zero_in_time(robot, killed_ns, host)
 
 
 @pytest.mark.slow
@@ -134,7 +139,7 @@ def test_after_an_emergency_stop_the_runner_waits_and_says_so_in_one_line_until_
 ) -> None:
     waiting = "waiting for `edge-bridge arm`"
     assert operate("stop", robot.socket)[0] == 0
-    with running("edge.runner", *robot.arguments(), folder=robot.folder, ready=waiting) as runner:
+    with running("edge.run.command", *robot.arguments(), folder=robot.folder, ready=waiting) as runner:
         time.sleep(3.0)
         assert robot.moves() == []
         assert operate("arm", robot.socket)[0] == 0
@@ -152,10 +157,7 @@ def test_frozen_while_driving_the_robot_gets_zero_within_300_ms_and_old_commands
         time.sleep(1.0)
         runner.process.send_signal(signal.SIGCONT)
         status = runner.process.wait(20)
-    after = [(stamp_ns, zero) for stamp_ns, zero in robot.moves() if stamp_ns >= frozen_ns]
-    zero_ns = next(stamp_ns for stamp_ns, zero in after if zero)
-    check_stop_latency(zero_ns - frozen_ns, STOP_BOUND_NS, frozen_ns, host)
-    assert all(zero for stamp_ns, zero in after if stamp_ns > zero_ns)
+    check_zero_in_time(robot, frozen_ns, host)
     assert status == 1, "a run that the bridge had to stop is a failed run"
 
 
@@ -178,7 +180,7 @@ def test_a_terminal_that_takes_nothing_does_not_keep_a_signal_from_stopping_the_
     reader, writer = os.pipe()
     fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, 4096)
     os.write(writer, b"x" * fcntl.fcntl(writer, fcntl.F_GETPIPE_SZ))
-    command = [sys.executable, "-m", "edge.runner", *map(str, robot.arguments())]
+    command = [sys.executable, "-m", "edge.run.command", *map(str, robot.arguments())]
     runner = subprocess.Popen(command, stderr=writer, cwd=REPOSITORY)
     try:
         wait_for(robot.is_moving, 30, "the robot to be told to move")

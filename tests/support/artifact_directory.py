@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -59,3 +60,11 @@ def write_artifacts(model: TicVla, directory: Path, *, pair: bool = False, preci
     }
     (directory / MANIFEST_NAME).write_text(json.dumps(seal(manifest)))
     return directory
+
+
+def edit_manifest(directory: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Change a manifest as somebody would who also seals it again."""
+    path = directory / MANIFEST_NAME
+    manifest = json.loads(path.read_text())
+    change(manifest)
+    path.write_text(json.dumps(seal(manifest)))

@@ -25,13 +25,13 @@ import numpy.typing as npt
 from rich.console import Console
 from rich.table import Table
 
-from edge import runner
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
 from edge.core.geometry import SE2
 from edge.flightlog.reader import RecordingError, read_messages
 from edge.inference.policy import Policy
 from edge.power.monitor import PowerMonitor
-from edge.state.reasoning_budget import UNLIMITED, ReasoningBudget
+from edge.reasoning.generation_cycle import UNLIMITED, ReasoningBudget
+from edge.run import command as runner
 from edge.state.semantic import SemanticState
 from sim_hil.realtime.children import Children, StepError
 from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_FILE, free_domain, socket_dir

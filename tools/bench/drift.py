@@ -26,7 +26,8 @@ import numpy as np
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
 from edge.core.geometry import SE2, wrap_angle
 from edge.odometry.drift_rate import Comparison, DriftMonitor
-from edge.odometry.estimator import DriftConfig, DriftEstimator, OdometryInputs
+from edge.odometry.estimator import DriftEstimator
+from edge.odometry.gate import OdometryInputs
 from sim_hil.robots.odometry_noise import LEVELS, OdometryNoise
 from sim_hil.scene.scene import load_scene
 from tools.bench.sim.drift_runs import CAMERA_DELAY_NS, STAND_S, STATE_NS, SensorNoise, Walk, record_walk
@@ -81,7 +82,7 @@ class DriftRun:
 def replay(walk: Walk, level: str, seed: int) -> DriftRun:
     """Let the odometry of a walk drift and the estimator work against it."""
     noise = OdometryNoise(LEVELS[level], seed, walk.samples[0].T_world_base)
-    estimator = DriftEstimator(config=DriftConfig(stamp_sigma_s=SensorNoise().stamp_ns / 1e9))
+    estimator = DriftEstimator(stamp_sigma_s=SensorNoise().stamp_ns / 1e9)
     truth_monitor = _TrueDrift()
     raws: list[SE2] = []
     windows: list[Window] = []

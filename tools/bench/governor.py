@@ -24,7 +24,7 @@ from typing import Any, Final
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
 from edge.power.governor.governor import Governor, GovernorConfig, GovernorInputs, GovernorOutputs
 from edge.power.governor.plan import PowerPlan, power_plan
-from edge.state.reasoning_budget import UNLIMITED, ReasoningBudget
+from edge.reasoning.generation_cycle import UNLIMITED, ReasoningBudget
 from export.model.config import PRESETS
 from export.plan.plan import plan
 from export.target.file import load_target

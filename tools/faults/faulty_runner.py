@@ -3,8 +3,8 @@
     python -m tools.faults.faulty_runner SOCKET --artifacts DIR --robot FILE.toml --instruction TEXT ...
 
 The product has no hook for faults: this program replaces methods of its classes in its own process and then calls the
-unchanged `edge.runner.main` with the arguments after SOCKET. Besides, untrained weights pass for trained ones: the plan
-that `Policy.act` returns (`circle.py`) and the language model's text are exchanged for what those would give. Both
+unchanged `edge.run.command.main` with the arguments after SOCKET. Besides, untrained weights pass for trained ones: the
+plan that `Policy.act` returns (`circle.py`) and the language model's text are exchanged for what those would give. Both
 networks run all the same.
 """
 
@@ -25,12 +25,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge import runner
 from edge.core.geometry import SE2
 from edge.flightlog.part import PartFile
 from edge.inference.graph import GraphError
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
+from edge.run import command as runner
 from edge.state.reasoning_text import format_waypoints
 from tools.faults import circle
 from tools.faults.switches import Switches

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from edge.artifacts.device_nodes import device_nodes
+from edge.artifacts.providers import device_nodes
 from edge.deploy.doctor.check import Check, Level, skipped
 from edge.deploy.doctor.user import Whom
 from edge.deploy.service_users import RUNNER_USER

@@ -16,7 +16,7 @@ from edge.core.geometry import SE2
 from edge.flightlog.reader import RecordingError, jpeg_bytes, read_messages
 from edge.reasoning.decoding_rules import FOLLOWS, FREE, DecodingContext, TurnDistances
 from edge.reasoning.path_memory import Way
-from edge.reasoning.prompt import told_before
+from edge.reasoning.prompt import format_before
 from edge.state.reasoning_text import LEFT, PROGRESS_HEAD, RIGHT, Progress, parse_progress
 from firmware_bridge.core.config import ConfigError, LimitsConfig
 
@@ -154,7 +154,7 @@ def _generation(payload: Mapping[str, Any]) -> RecordedGeneration:
         anchor_pose=_pose(payload["anchor_pose"]),
         way=None if "way" not in payload else tuple(_point(point) for point in payload["way"]),
         context=DecodingContext(
-            _before(payload.get("before", told_before(None))),
+            _before(payload.get("before", format_before(None))),
             _follow(payload.get("follow", FREE)),
             _turn(payload.get("turn"), payload.get("turn_left_m")),
             _flag(payload.get("turn_may_be_done", True)),
@@ -198,7 +198,7 @@ def _point(values: Any) -> tuple[float, float]:
 def _before(value: Any) -> Progress | None:
     text = _text(value)
     progress = parse_progress(PROGRESS_HEAD + text)
-    if told_before(progress) != text:
+    if format_before(progress) != text:
         raise ValueError(f"{text[:60]!r} is no progress")
     return progress
 

@@ -21,7 +21,7 @@ from edge.power.governor.levels import GenerationTimes, LevelEstimator, Levels, 
 from edge.power.governor.limits import HeatAndBattery, LimitsConfig
 from edge.power.governor.plan import PowerModel
 from edge.power.meters.meter import is_power
-from edge.state.reasoning_budget import UNLIMITED, ReasoningBudget
+from edge.reasoning.generation_cycle import UNLIMITED, ReasoningBudget
 
 LEVELS: Final = ("full", "half", "quarter", "prompt", "off")
 """Names of the steps; the pause is part of each but the last."""

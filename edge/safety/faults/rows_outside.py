@@ -189,7 +189,7 @@ START: tuple[Fault, ...] = (
         "artifact-corrupt", 53, Action.STOP, 0, "start",
         "A file of the artifacts is not what its manifest says.",
         "Copy or export the artifacts again.",
-        "tests/edge/artifacts/test_manifest.py::test_one_flipped_bit_anywhere_is_refused_by_name",
+        "tests/edge/artifacts/test_manifest.py::test_a_damaged_directory_is_refused",
     ),
     Fault(
         "external-data", 54, Action.STOP, 0, "start",
@@ -207,7 +207,7 @@ START: tuple[Fault, ...] = (
         "code-in-artifacts", 56, Action.STOP, 0, "start",
         "There is a file among the artifacts that the manifest does not list (a pickle could run code).",
         "Delete it, or export the artifacts again.",
-        "tests/edge/artifacts/test_manifest.py::test_a_file_that_is_not_listed_is_refused",
+        "tests/edge/artifacts/test_manifest.py::test_a_damaged_directory_is_refused[a file that is not listed]",
     ),
     Fault(
         "bad-configuration", 57, Action.STOP, 0, "start",

@@ -6,6 +6,9 @@ from edge.safety.faults.row import Action, Escalation, Fault
 
 _HERE = "runner"
 _LOOP = "tests/edge/run/test_control_loop_faults.py::test_"
+_STOPPED = _LOOP + "the_robot_stops_in_time_and_drives_again_unless_the_fault_latches"
+_LIMITED = _LOOP + "the_speed_is_limited_in_time"
+_ONCE = _LOOP + "once_it_is_found_and_the_robot_drives_on"
 _ROBOT = "tests/edge/run/test_robot_inputs.py::test_"
 
 INPUTS: tuple[Fault, ...] = (
@@ -13,56 +16,56 @@ INPUTS: tuple[Fault, ...] = (
         "camera-stopped", 1, Action.ZERO, 500, _HERE,
         "There is no new picture to drive by.",
         "Check the camera's cable and service; driving goes on 1 s after pictures are back.",
-        _LOOP + "a_camera_that_stops",
+        _STOPPED + "[camera-stopped]",
     ),
     Fault(
         "camera-frozen", 2, Action.ZERO, 500, _HERE,
         "The camera repeats pictures, or its scene stays the same, although the robot has moved.",
         "If the robot did not slip on the spot, restart the camera service; driving goes on when the scene changes.",
-        _LOOP + "a_picture_that_does_not_change_while_the_robot_moves",
+        _STOPPED + "[camera-frozen]",
     ),
     Fault(
         "camera-stale", 3, Action.ZERO, 300, _HERE,
         "Pictures are more than 300 ms old when they arrive, too old to drive by.",
         "Look for a queue or a slow network between camera and runner.",
-        _LOOP + "pictures_that_arrive_old",
+        _STOPPED + "[camera-stale]",
     ),
     Fault(
         "camera-from-future", 4, Action.ZERO, 300, _HERE,
         "A picture carries a time that has not come yet.",
         "Check what stamps the pictures: stamps must be this machine's monotonic clock.",
-        _LOOP + "a_picture_from_the_future",
+        _STOPPED + "[camera-from-future]",
     ),
     Fault(
         "camera-slow", 5, Action.LIMIT, 1000, _HERE,
         "The camera sends far fewer pictures than it should.",
         "Look for load on the robot's computer or network; the robot drives at half speed.",
-        _LOOP + "half_of_the_pictures_missing",
+        _LIMITED + "[camera-slow]",
         speed_scale=0.5,
     ),
     Fault(
         "camera-too-slow", 5, Action.ZERO, 2000, _HERE,
         "The camera sends less than 40 % of its pictures.",
         "Look for load on the robot's computer or network.",
-        _LOOP + "two_thirds_of_the_pictures_missing",
+        _STOPPED + "[camera-too-slow]",
     ),
     Fault(
         "frame-refused", 6, Action.LIMIT, 500, _HERE,
         "A picture was black, saturated, torn or of the wrong size and was not used.",
         "Nothing to do unless it comes back: then clean or replace the camera.",
-        _LOOP + "one_bad_picture",
+        _ONCE + "[frame-refused black]",
     ),
     Fault(
         "frames-refused", 6, Action.ZERO, 500, _HERE,
         "Three pictures in a row were black, saturated, torn or of the wrong size.",
         "Uncover or clean the lens, check the light, then the camera's cable.",
-        _LOOP + "three_bad_pictures_in_a_row",
+        _STOPPED + "[frames-refused black]",
     ),
     Fault(
         "camera-swapped", 7, Action.STOP, 2000, _HERE,
         "The pictures have another size than at the start: it is another camera or another setting.",
         "Put the camera back that the robot was calibrated with and start the runner again.",
-        _LOOP + "another_camera",
+        _STOPPED + "[camera-swapped]",
     ),
     Fault(
         "odometry-jump", 8, Action.ZERO, 100, _HERE,
@@ -107,7 +110,7 @@ INPUTS: tuple[Fault, ...] = (
         "odometry-stale", 11, Action.ZERO, 300, _HERE,
         "The robot's pose is too old to drive by.",
         "Check the cable to the robot and that the robot is on.",
-        _LOOP + "odometry_that_stops",
+        _STOPPED + "[odometry-stale]",
     ),
     Fault(
         "odometry-speed-mismatch", 12, Action.STOP, 300, _HERE,
@@ -132,7 +135,7 @@ INPUTS: tuple[Fault, ...] = (
         "battery-low", 50, Action.LIMIT, 5000, _HERE,
         "The battery is low.",
         "Bring the robot home; it drives at half speed.",
-        _LOOP + "a_low_battery",
+        _LIMITED + "[battery-low]",
         clear_ms=10_000,
         speed_scale=0.5,
     ),
@@ -140,7 +143,7 @@ INPUTS: tuple[Fault, ...] = (
         "battery-empty", 50, Action.STOP, 5000, _HERE,
         "The battery is nearly empty.",
         "Let the robot sit down with its remote and charge it.",
-        _LOOP + "an_empty_battery",
+        _STOPPED + "[battery-empty]",
     ),
 )  # fmt: skip
 
@@ -156,58 +159,58 @@ MODEL: tuple[Fault, ...] = (
         "output-out-of-range", 14, Action.LIMIT, 100, _HERE,
         "The action expert asked for far more speed than the robot may drive; it was cut to the limit.",
         "Nothing to do unless it comes back.",
-        _LOOP + "one_output_out_of_range",
+        _ONCE + "[output-out-of-range]",
         escalation=Escalation("output-out-of-range-often", 5, 1000),
     ),
     Fault(
         "output-out-of-range-often", 14, Action.STOP, 1000, _HERE,
         "The action expert asked five times within 1 s for far more speed than the robot may drive.",
         "Do not drive with these artifacts: verify them, then look at the flight log.",
-        _LOOP + "five_outputs_out_of_range",
+        _STOPPED + "[output-out-of-range-often]",
     ),
     Fault(
         "output-unsteady", 15, Action.LIMIT, 1000, _HERE,
         "The action expert keeps changing its mind faster than the robot may follow.",
         "Look at the flight log; the robot drives at half speed.",
-        _LOOP + "an_output_that_wavers",
+        _LOOP + "plans_that_change_sides[output-unsteady]",
         speed_scale=0.5,
     ),
     Fault(
         "output-oscillating", 15, Action.ZERO, 1000, _HERE,
         "The action expert's output swings from one side to the other at every tick.",
         "Look at the flight log before driving on with these artifacts.",
-        _LOOP + "an_output_that_oscillates",
+        _LOOP + "plans_that_change_sides[output-oscillating]",
     ),
     Fault(
         "output-constant", 16, Action.ZERO, 2500, _HERE,
         "The action expert gives the same plan although what it sees has changed for 2 s.",
         "Verify the artifacts; a network that ignores its inputs must not drive.",
-        _LOOP + "an_output_that_never_changes",
+        _STOPPED + "[output-constant]",
     ),
     Fault(
         "semantic-old", 17, Action.LIMIT, 10_300, _HERE,
         "The last answer of the reasoning is older than the policy was trained for; the speed falls with its age.",
         "Reasoning is slow: allow fewer tokens or more power.",
-        _LOOP + "an_old_semantic_state",
+        _LIMITED + "[semantic-old]",
     ),
     Fault(
         "semantic-expired", 17, Action.ZERO, 15_300, _HERE,
         "The last answer of the reasoning is too old to drive by.",
         "Driving goes on with its next answer; a call that hangs is interrupted.",
-        _LOOP + "reasoning_that_hangs",
+        _STOPPED + "[semantic-expired]",
     ),
     Fault(
         "reasoning-failed", 18, Action.LIMIT, 300, _HERE,
         "A run of the reasoning failed; the next one is tried.",
         "Nothing to do unless it comes back.",
-        _LOOP + "one_failure_of_the_reasoning",
+        _ONCE + "[reasoning-failed]",
         escalation=Escalation("reasoning-failing", 5, 60_000),
     ),
     Fault(
         "reasoning-failing", 18, Action.STOP, 300, _HERE,
         "Reasoning failed five times within 60 s.",
         "Verify the artifacts and look at the memory in use: edge-doctor.",
-        _LOOP + "five_failures_of_the_reasoning",
+        _STOPPED + "[reasoning-failing]",
     ),
     Fault(
         "reasoning-hung", 17, Action.STOP, 30_300, _HERE,
@@ -247,14 +250,14 @@ MACHINE: tuple[Fault, ...] = (
         "tick-late", 22, Action.LIMIT, 1000, _HERE,
         "The control loop is often late.",
         "Something else uses the processor: edge-doctor says what; the robot drives at half speed.",
-        _LOOP + "ticks_that_are_often_late",
+        _LIMITED + "[tick-late]",
         speed_scale=0.5,
     ),
     Fault(
         "tick-overrun", 22, Action.ZERO, 300, _HERE,
         "The last pass of the control loop took longer than two periods.",
         "Something else uses the processor: edge-doctor says what.",
-        _LOOP + "a_tick_that_takes_too_long",
+        _LOOP + "a_tick_that_takes_too_long_stops_the_robot_and_a_late_one_does_not",
     ),
     Fault(
         "wall-clock-moved", 33, Action.NOTHING, 0, _HERE,
@@ -266,7 +269,7 @@ MACHINE: tuple[Fault, ...] = (
         "suspended", 34, Action.STOP, 300, _HERE,
         "The machine slept while the robot was armed: everything that is known is old.",
         "Turn suspend off on this machine, then arm again.",
-        _LOOP + "a_machine_that_slept",
+        _STOPPED + "[suspended]",
     ),
     Fault(
         "clock-backwards", 34, Action.STOP, 300, _HERE,
@@ -278,7 +281,7 @@ MACHINE: tuple[Fault, ...] = (
         "thermal-throttle", 48, Action.LIMIT, 2000, _HERE,
         "The machine is hot and has lowered its clocks.",
         "Let it cool: check fan and dust; the robot drives at half speed.",
-        _LOOP + "a_machine_that_throttles",
+        _LIMITED + "[thermal-throttle]",
         clear_ms=5000,
         speed_scale=0.5,
     ),
@@ -286,7 +289,7 @@ MACHINE: tuple[Fault, ...] = (
         "thermal-trip", 48, Action.STOP, 2000, _HERE,
         "The machine is about to switch itself off from heat.",
         "Let it cool down before arming again.",
-        _LOOP + "a_machine_at_its_thermal_trip",
+        _STOPPED + "[thermal-trip]",
     ),
     Fault(
         "log-disk-full", 51, Action.NOTHING, 0, _HERE,

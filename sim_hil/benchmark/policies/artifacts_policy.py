@@ -81,7 +81,7 @@ class ArtifactsPolicy:
 
     def reset(self, episode: Episode, instruction: str, world: object | None, seed: int) -> None:
         """Begin an episode without frames and semantic state. Raises InstructionError if the prompt is too long."""
-        self._language.check_instruction(instruction, len(self._artifacts.runtime.frame_offsets_s))
+        self._language.check_instruction(instruction)
         draw = LatencySampler(self._latency, seed, episode.id).draw
         self._drive = _Drive(
             self._artifacts, self._model, self._language, self._robot, self._mode, instruction, draw, self._switches

@@ -13,10 +13,11 @@ from typing import Any
 import pytest
 
 from edge import signature
-from edge.artifacts.files import ArtifactError, seal
+from edge.artifacts.files import ArtifactError
 from edge.artifacts.manifest import load_artifacts
 from edge.artifacts.trust import KeyFileError, Trust
 from edge.signature import keygen, main, sign
+from tests.support.artifact_directory import edit_manifest
 
 pytest.importorskip("cryptography")
 
@@ -40,32 +41,11 @@ def trust(keys: Path, tmp_path: Path) -> Trust:
     return Trust(keys / "ours.pub", tmp_path / "state" / "release.json")
 
 
-def test_signed_artifacts_are_accepted_and_say_their_release(copy: Path, keys: Path, trust: Trust) -> None:
+@pytest.fixture
+def signed(copy: Path, keys: Path) -> Path:
+    """Artifacts that the trusted key has signed as release 7."""
     sign(copy, keys / "ours", 7)
-    assert load_artifacts(copy, trust).release == 7
-
-
-def test_without_a_trusted_key_a_signature_changes_nothing(copy: Path, keys: Path) -> None:
-    sign(copy, keys / "theirs", 7)
-    assert load_artifacts(copy).release is None
-
-
-def test_unsigned_artifacts_are_refused(copy: Path, trust: Trust) -> None:
-    with pytest.raises(ArtifactError, match=r"manifest\.sig: missing"):
-        load_artifacts(copy, trust)
-
-
-def test_artifacts_signed_by_another_key_are_refused(copy: Path, keys: Path, trust: Trust) -> None:
-    sign(copy, keys / "theirs", 7)
-    with pytest.raises(ArtifactError, match="signed with the key"):
-        load_artifacts(copy, trust)
-
-
-def test_another_key_that_claims_to_be_the_trusted_one_is_refused(copy: Path, keys: Path, trust: Trust) -> None:
-    sign(copy, keys / "theirs", 7)
-    change(copy, key_id=trust.key_id)
-    with pytest.raises(ArtifactError, match="not a signature of this manifest"):
-        load_artifacts(copy, trust)
+    return copy
 
 
 def change(directory: Path, **values: Any) -> None:
@@ -73,32 +53,57 @@ def change(directory: Path, **values: Any) -> None:
     path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
 
 
-def test_a_manifest_that_was_changed_and_sealed_again_is_refused_before_it_is_parsed(
-    copy: Path, keys: Path, trust: Trust, monkeypatch: pytest.MonkeyPatch
+def test_signed_artifacts_are_accepted_and_say_their_release(signed: Path, trust: Trust) -> None:
+    assert load_artifacts(signed, trust).release == 7
+
+
+def test_without_a_trusted_key_a_signature_changes_nothing(copy: Path, keys: Path) -> None:
+    sign(copy, keys / "theirs", 7)
+    assert load_artifacts(copy).release is None
+
+
+MISSHAPEN: list[dict[str, Any]] = [
+    {"release": 0}, {"release": "9"}, {"release": 2**64}, {"signature": "!"}, {"signature": ""}, {"schema": 2},
+    {"extra": 1}, {"key_id": None},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("key", "values", "message"),
+    [
+        (None, {}, r"manifest\.sig: missing"),
+        ("theirs", {}, "signed with the key"),
+        ("theirs", {"key_id": "ours"}, "not a signature of this manifest"),
+        ("ours", {"release": 8}, "not a signature of this manifest"),
+        *(("ours", values, r"manifest\.sig") for values in MISSHAPEN),
+    ],
+    ids=str,
+)
+def test_artifacts_without_a_signature_by_the_trusted_key_are_refused_in_one_line(
+    copy: Path, keys: Path, trust: Trust, key: str | None, values: dict[str, Any], message: str
 ) -> None:
-    sign(copy, keys / "ours", 7)
-    manifest = json.loads((copy / "manifest.json").read_text())
-    manifest["runtime"]["tick_period_ms"] = 900
-    (copy / "manifest.json").write_text(json.dumps(seal(manifest)))
+    if key is not None:
+        sign(copy, keys / key, 7)
+        change(copy, **{name: trust.key_id if value == "ours" else value for name, value in values.items()})
+    with pytest.raises(ArtifactError, match=message) as refusal:
+        load_artifacts(copy, trust)
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_manifest_that_was_changed_and_sealed_again_is_refused_before_it_is_parsed(
+    signed: Path, trust: Trust, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    edit_manifest(signed, lambda m: m["runtime"].update(tick_period_ms=900))
     monkeypatch.setattr("edge.artifacts.manifest.parse_manifest", lambda *_: pytest.fail("parsed"))
     with pytest.raises(ArtifactError, match="not a signature of this manifest"):
-        load_artifacts(copy, trust)
+        load_artifacts(signed, trust)
 
 
 def test_a_signature_of_another_directory_is_refused(copy: Path, keys: Path, trust: Trust, tmp_path: Path) -> None:
     other = Path(shutil.copytree(copy, tmp_path / "other"))
-    manifest = json.loads((other / "manifest.json").read_text())
-    manifest["target"] = "orin"
-    (other / "manifest.json").write_text(json.dumps(seal(manifest)))
+    edit_manifest(other, lambda m: m.update(target="orin"))
     sign(other, keys / "ours", 7)
     shutil.copy(other / "manifest.sig", copy)
-    with pytest.raises(ArtifactError, match="not a signature of this manifest"):
-        load_artifacts(copy, trust)
-
-
-def test_a_release_number_cannot_be_edited(copy: Path, keys: Path, trust: Trust) -> None:
-    sign(copy, keys / "ours", 7)
-    change(copy, release=8)
     with pytest.raises(ArtifactError, match="not a signature of this manifest"):
         load_artifacts(copy, trust)
 
@@ -132,28 +137,25 @@ def test_a_robot_that_comes_to_trust_a_new_key_starts_a_new_row(copy: Path, keys
 
 
 @pytest.mark.parametrize("content", ["", "{}", "[]", '{"schema": 1, "key_id": "x", "release": true}', "x" * 9000])
-def test_a_damaged_counter_is_no_reason_to_go_back(copy: Path, keys: Path, tmp_path: Path, content: str) -> None:
+def test_a_damaged_counter_is_no_reason_to_go_back(signed: Path, keys: Path, tmp_path: Path, content: str) -> None:
     counter = tmp_path / "release.json"
     counter.write_text(content)
-    sign(copy, keys / "ours", 9)
     with pytest.raises(ArtifactError, match=r"release\.json"):
-        load_artifacts(copy, Trust(keys / "ours.pub", counter))
+        load_artifacts(signed, Trust(keys / "ours.pub", counter))
 
 
-def test_a_counter_that_cannot_be_kept_is_a_refusal(copy: Path, keys: Path, tmp_path: Path) -> None:
+def test_a_counter_that_cannot_be_kept_is_a_refusal(signed: Path, keys: Path, tmp_path: Path) -> None:
     (tmp_path / "state").write_text("a file where the state directory should be")
-    sign(copy, keys / "ours", 9)
     with pytest.raises(ArtifactError, match="cannot be remembered"):
-        load_artifacts(copy, Trust(keys / "ours.pub", tmp_path / "state" / "release.json"))
+        load_artifacts(signed, Trust(keys / "ours.pub", tmp_path / "state" / "release.json"))
 
 
 @pytest.mark.parametrize("step", ["fsync", "replace"])
 def test_a_power_cut_while_the_counter_is_written_leaves_the_old_one(
-    copy: Path, keys: Path, trust: Trust, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
+    signed: Path, keys: Path, trust: Trust, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
 ) -> None:
-    sign(copy, keys / "ours", 7)
-    load_artifacts(copy, trust)
-    sign(copy, keys / "ours", 8)
+    load_artifacts(signed, trust)
+    sign(signed, keys / "ours", 8)
 
     class PowerCutError(BaseException):
         pass
@@ -164,43 +166,15 @@ def test_a_power_cut_while_the_counter_is_written_leaves_the_old_one(
     with monkeypatch.context() as patch:
         patch.setattr(*((os, "fsync") if step == "fsync" else (Path, "replace")), cut)
         with pytest.raises(PowerCutError):
-            load_artifacts(copy, trust)
+            load_artifacts(signed, trust)
     assert json.loads((tmp_path / "state" / "release.json").read_text())["release"] == 7
-    assert load_artifacts(copy, trust).release == 8
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
-        {"release": 0},
-        {"release": "9"},
-        {"release": 2**64},
-        {"signature": "!"},
-        {"signature": ""},
-        {"schema": 2},
-        {"extra": 1},
-        {"key_id": None},
-    ],
-    ids=str,
-)
-def test_a_misshapen_signature_file_is_refused_in_one_line(
-    copy: Path, keys: Path, trust: Trust, values: dict[str, Any]
-) -> None:
-    sign(copy, keys / "ours", 7)
-    change(copy, **values)
-    with pytest.raises(ArtifactError, match=r"manifest\.sig") as refusal:
-        load_artifacts(copy, trust)
-    assert "\n" not in str(refusal.value)
+    assert load_artifacts(signed, trust).release == 8
 
 
 def test_a_key_that_is_none_is_never_trusted(tmp_path: Path, keys: Path) -> None:
     (tmp_path / "empty.pub").touch()
-    for file, said in (
-        (tmp_path / "empty.pub", "not a PEM"),
-        (tmp_path / "none", "not a PEM"),
-        (keys / "ours", "not a PEM"),
-    ):
-        with pytest.raises(KeyFileError, match=said):
+    for file in (tmp_path / "empty.pub", tmp_path / "none", keys / "ours"):
+        with pytest.raises(KeyFileError, match="not a PEM"):
             Trust(file, tmp_path / "release.json")
 
 

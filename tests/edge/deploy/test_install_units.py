@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
-from edge.artifacts.device_nodes import PATTERNS, device_nodes, group_of
 from edge.artifacts.files import seal
+from edge.artifacts.providers import PATTERNS, device_nodes, group_of
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_REFUSED
 from edge.core.device import CUDA, TENSORRT
 from edge.deploy.install import main

@@ -21,7 +21,7 @@ from edge.motion.controller import Controller, ControllerConfig, ControllerInput
 from edge.motion.recovery import BACKING_OFF, TURNING
 from edge.reasoning.decoding_rules import EITHER_WAY, DecodingContext, TextConstraint, TurnDistances
 from edge.reasoning.path_memory import way_of
-from edge.reasoning.prompt import told_before
+from edge.reasoning.prompt import format_before
 from edge.run.camera import decode_frame
 from edge.state.reasoning_text import Progress
 from edge.state.ring import EncodedFrame
@@ -112,7 +112,7 @@ def think(policy: Policy, language: LanguageModel, frames: list[EncodedFrame], n
     generation = language.generate(prompt, max_new_tokens=6 + number, cancelled=lambda: False)
     context = policy.semantic_context(generation.last_layer_kv)
     anchor, kv = seen[-1], generation.last_layer_kv
-    TOLD[number] = {"way": way, "before": told_before(before)}
+    TOLD[number] = {"way": way, "before": format_before(before)}
     THOUGHTS[number] = [frame.stamp_ns for frame in seen], generation.new_tokens
     return SemanticState(number, anchor.stamp_ns, anchor.T_odom_base, 0, kv, context, generation.text, None)
 

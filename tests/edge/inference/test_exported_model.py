@@ -11,7 +11,7 @@ from tokenizers import Tokenizer
 from edge.artifacts.files import ArtifactError
 from edge.artifacts.manifest import Artifacts
 from edge.core.geometry import SE2
-from edge.inference.graph import CancelledError, Graph
+from edge.inference.graph import Graph
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
 from edge.state.ring import EncodedFrame
@@ -49,20 +49,6 @@ def test_the_exported_model_generates_the_same_text_as_pytorch(artifacts: Artifa
     full = found.last_layer_kv
     assert full.shape == (1, len(ids) + len(new), NANO.kv_dim)
     assert np.allclose(full[:, : kv.shape[1]], kv.numpy()[:, : full.shape[1]], atol=1e-3)
-
-
-def test_a_generation_stops_between_two_calls(artifacts: Artifacts) -> None:
-    language = LanguageModel(artifacts)
-    calls: list[int] = []
-
-    def cancelled() -> bool:
-        calls.append(1)
-        return len(calls) > 3
-
-    frames = [EncodedFrame(0, SE2(0, 0, 0), np.zeros((1, 64, 256), dtype=np.float32))]
-    with pytest.raises(CancelledError):
-        language.generate(language.prompt.build(frames, "go"), max_new_tokens=48, cancelled=cancelled)
-    assert len(calls) == 4
 
 
 def test_a_provider_that_does_not_load_is_refused_and_not_silently_the_cpu(

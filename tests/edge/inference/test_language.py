@@ -70,32 +70,21 @@ def expected(artifacts: Artifacts) -> tuple[np.ndarray, tuple[int, ...]]:
     return generation.last_layer_kv, generation.token_ids
 
 
-@pytest.mark.parametrize("size", [1, 7, 16, 33, 100])
-def test_any_chunk_length_gives_the_same_answer(artifacts: Artifacts, expected: tuple, size: int) -> None:
-    language = model(artifacts, size)
+@pytest.mark.parametrize(
+    ("directory", "size"),
+    [
+        *(("artifacts", size) for size in (1, 7, 16, 33, 100)),
+        *(pytest.param("pair", size, marks=pytest.mark.slow) for size in (16, 10_000)),
+    ],
+)
+def test_any_chunk_length_gives_the_same_answer(
+    request: pytest.FixtureRequest, expected: tuple, directory: str, size: int
+) -> None:
+    language = model(request.getfixturevalue(directory), size)
     segments = language.prompt.build(frames(4, 64, 256), SENTENCE)
     generation = language.generate(segments, max_new_tokens=12, cancelled=lambda: False)
     np.testing.assert_allclose(generation.last_layer_kv, expected[0], atol=2e-4)
     assert generation.token_ids == expected[1]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("size", [16, 10_000])
-def test_the_pair_gives_the_same_answer(pair: Artifacts, expected: tuple, size: int) -> None:
-    language = model(pair, size)
-    segments = language.prompt.build(frames(4, 64, 256), SENTENCE)
-    generation = language.generate(segments, max_new_tokens=12, cancelled=lambda: False)
-    np.testing.assert_allclose(generation.last_layer_kv, expected[0], atol=2e-4)
-    assert generation.token_ids == expected[1]
-
-
-def test_what_an_earlier_generation_left_in_the_buffers_is_not_read(artifacts: Artifacts, expected: tuple) -> None:
-    language = model(artifacts, 64)
-    other = language.prompt.build(frames(4, 64, 256, seed=9), SENTENCE * 3)
-    language.generate(other, max_new_tokens=30, cancelled=lambda: False)
-    again = language.prompt.build(frames(4, 64, 256), SENTENCE)
-    generation = language.generate(again, max_new_tokens=12, cancelled=lambda: False)
-    np.testing.assert_allclose(generation.last_layer_kv, expected[0], atol=2e-4)
 
 
 def test_a_generations_keys_and_values_survive_the_next_generation(artifacts: Artifacts) -> None:
@@ -106,14 +95,6 @@ def test_a_generations_keys_and_values_survive_the_next_generation(artifacts: Ar
     kept = first.last_layer_kv.copy()
     language.generate(language.prompt.build(frames(1, 64, 256, 3), "go"), max_new_tokens=2, cancelled=lambda: False)
     np.testing.assert_array_equal(first.last_layer_kv, kept)
-
-
-def test_one_row_of_keys_and_values_for_every_token_fed(artifacts: Artifacts) -> None:
-    language = model(artifacts, 64)
-    segments = language.prompt.build(frames(2, 64, 256), SENTENCE)
-    generation = language.generate(segments, max_new_tokens=5, cancelled=lambda: False)
-    fed = generation.prompt_tokens + generation.new_tokens
-    assert generation.last_layer_kv.shape == (1, fed, artifacts.runtime.kv_dim)
 
 
 def test_a_generation_stops_between_two_chunks(artifacts: Artifacts) -> None:
@@ -174,10 +155,13 @@ def test_an_interrupt_from_another_thread_ends_a_call_that_is_under_way(artifact
         language.begin(cancelled, interrupt=interrupt).finish(segments, max_new_tokens=5)
 
 
-def test_what_was_interrupted_leaves_no_trace_in_the_next_generation(artifacts: Artifacts, expected: tuple) -> None:
+def test_what_an_earlier_or_interrupted_generation_left_in_the_buffers_is_not_read(
+    artifacts: Artifacts, expected: tuple
+) -> None:
     language = model(artifacts, 64)
     interrupt = Interrupt()
-    other = language.prompt.build(frames(4, 64, 256, seed=9), SENTENCE)
+    other = language.prompt.build(frames(4, 64, 256, seed=9), SENTENCE * 3)
+    language.generate(other, max_new_tokens=30, cancelled=lambda: False)
     run = language.begin(lambda: False, interrupt=interrupt)
     run.feed(other[:2])
     interrupt.set()
@@ -187,13 +171,6 @@ def test_what_was_interrupted_leaves_no_trace_in_the_next_generation(artifacts: 
     generation = language.generate(segments, max_new_tokens=12, cancelled=lambda: False)
     np.testing.assert_allclose(generation.last_layer_kv, expected[0], atol=2e-4)
     assert generation.token_ids == expected[1]
-
-
-def test_a_prompt_longer_than_the_context_is_refused(artifacts: Artifacts) -> None:
-    language = model(artifacts, 64)
-    segments = language.prompt.build(frames(4, 64, 256), SENTENCE) * 8
-    with pytest.raises(ContextOverflowError):
-        language.generate(segments, max_new_tokens=5, cancelled=lambda: False)
 
 
 @settings(max_examples=10)

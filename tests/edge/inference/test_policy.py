@@ -95,14 +95,6 @@ def test_a_bound_tick_plans_what_a_graph_of_its_own_plans(policy: Policy, artifa
     np.testing.assert_array_equal(found, graph.run(feeds)[0][0])
 
 
-def test_a_plan_survives_the_next_tick(policy: Policy, artifacts: Artifacts) -> None:
-    tokens, state = policy.encode(picture(1)), semantic(policy, artifacts, 1)
-    first = policy.act(tokens, (0.0, 0.0, 0.0), 0.0, HERE, state)
-    kept = first.copy()
-    policy.act(tokens, (0.9, 0.0, 0.9), 9.0, HERE, state)
-    np.testing.assert_array_equal(first, kept)
-
-
 def test_a_context_that_does_not_fit_the_graph_is_a_failure_of_that_tick_only(
     policy: Policy, artifacts: Artifacts
 ) -> None:
@@ -156,11 +148,6 @@ def test_artifacts_with_cores_of_their_own_make_a_schedule(artifacts: Artifacts)
     assert (made.control.cores, made.control.priority) == ((7,), 40)
     assert (made.reasoning.cores, made.reasoning.priority, made.shared) == ((5, 6), None, False)
     assert schedule_for(artifacts, allowed={0}).shared
-
-
-def test_a_priority_of_zero_is_none(artifacts: Artifacts) -> None:
-    runtime = dataclasses.replace(artifacts.runtime, control_priority=0)
-    assert schedule_for(dataclasses.replace(artifacts, runtime=runtime), allowed={0}).control.priority is None
 
 
 def test_the_language_models_workers_are_as_patient_as_reasoning_is(artifacts: Artifacts) -> None:

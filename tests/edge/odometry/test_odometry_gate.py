@@ -56,12 +56,6 @@ def test_a_pose_that_jumps_and_stays_is_one_jump_and_no_motion() -> None:
     assert sum(v.increment.dx_m for v in verdicts if v.increment) == pytest.approx(0.29, abs=1e-6)
 
 
-def test_a_pose_that_jumps_on_and_on_is_found_every_time() -> None:
-    verdicts = feed([report(0), *[report(i, x=float(2 * i)) for i in range(1, 5)]])
-    assert all("odometry-jump" in names(v) for v in verdicts[1:])
-    assert all(v.increment is None for v in verdicts)
-
-
 @pytest.mark.parametrize(
     "fields",
     [
@@ -70,8 +64,6 @@ def test_a_pose_that_jumps_on_and_on_is_found_every_time() -> None:
         {"vx_mps": math.nan},
         {"gyro_wz_radps": math.inf},
         {"pitch_rad": math.nan},
-        {"quaternion_norm": 0.0},
-        {"quaternion_norm": math.nan},
     ],
     ids=str,
 )
@@ -98,11 +90,6 @@ def test_a_pose_that_stays_without_a_command_to_walk_is_not_frozen(command: tupl
     assert all(not v.findings for v in feed([report(i, commanded=command) for i in range(100)]))
 
 
-def test_a_robot_that_walks_on_command_is_not_frozen() -> None:
-    reports = [replace(r, commanded=(0.5, 0.0, 0.0)) for r in walking(100)]
-    assert all(not v.findings for v in feed(reports))
-
-
 def test_two_speeds_that_disagree_by_more_than_half_a_metre_a_second_are_found_within_300_ms() -> None:
     bad = [report(i, x=0.01 * i, vx_mps=0.5 + (0.8 if i >= 20 else 0.0)) for i in range(60)]
     verdicts = feed(bad)
@@ -123,31 +110,13 @@ def test_reports_that_come_in_a_burst_have_the_speed_of_the_robots_clock() -> No
     assert all("odometry-speed-mismatch" not in names(v) for v in feed(reports))
 
 
-@pytest.mark.parametrize(("delay_ms", "expected"), [(100, []), (200, ["odometry-late"]), (300, ["odometry-stale"])])
-def test_reports_that_are_on_their_way_for_long_are_late(delay_ms: int, expected: list[str]) -> None:
-    punctual = [replace(r, robot_stamp_ns=r.received_ns) for r in walking(50)]
-    late = [
-        replace(r, robot_stamp_ns=r.received_ns, received_ns=r.received_ns + delay_ms * 1_000_000)
-        for r in walking(60)[50:]
-    ]
-    assert names(feed([*punctual, *late])[-1]) == expected
-
-
-def test_a_robots_clock_that_is_set_back_is_not_lag() -> None:
-    ahead = [replace(r, robot_stamp_ns=r.received_ns + 3_600_000_000_000) for r in walking(50)]
+@pytest.mark.parametrize("ahead_s", [2, 3600])
+def test_a_robots_clock_that_is_set_back_is_not_lag(ahead_s: int) -> None:
+    ahead = [replace(r, robot_stamp_ns=r.received_ns + ahead_s * 10**9) for r in walking(50)]
     back = [replace(r, robot_stamp_ns=r.received_ns) for r in walking(60)[50:]]
     verdicts = feed([*ahead, *back])
     assert all(not v.findings for v in verdicts)
     assert all(v.increment is not None for v in verdicts[1:])
-
-
-@pytest.mark.slow
-def test_a_delay_that_stays_is_found_for_as_long_as_it_does() -> None:
-    punctual = [replace(r, robot_stamp_ns=r.received_ns) for r in walking(50)]
-    late = [
-        replace(r, robot_stamp_ns=r.received_ns, received_ns=r.received_ns + 300_000_000) for r in walking(6000)[50:]
-    ]
-    assert all(names(v) == ["odometry-stale"] for v in feed([*punctual, *late])[50:])
 
 
 @pytest.mark.parametrize("ppm", [-90, 90])
@@ -156,12 +125,6 @@ def test_a_robots_clock_that_runs_a_little_fast_or_slow_is_no_delay(ppm: int) ->
         report(i, robot_stamp_ns=round((i + 1) * STEP_NS * (1 + ppm * 1e-6)) + 10**9) for i in range(0, 200000, 40)
     ]
     assert all(not v.findings for v in feed(reports))
-
-
-def test_a_robots_clock_that_is_set_back_a_little_is_not_lag() -> None:
-    before = [replace(r, robot_stamp_ns=r.received_ns + 2_000_000_000) for r in walking(50)]
-    after = [replace(r, robot_stamp_ns=r.received_ns) for r in walking(60)[50:]]
-    assert all(not v.findings for v in feed([*before, *after]))
 
 
 def turning(count: int, yaw_radps: float, gyro_radps: float) -> list[OdometryInputs]:
@@ -187,11 +150,6 @@ def test_a_gyro_that_is_a_little_off_is_followed() -> None:
 def test_a_gyro_is_not_judged_by_its_ends_of_a_long_silence() -> None:
     before, after = turning(20, 1.0, 1.0), [report(i, theta=0.4, gyro_wz_radps=0.0) for i in range(100, 140)]
     assert all("odometry-speed-mismatch" not in names(v) for v in feed([*before, *after]))
-
-
-def test_a_frozen_pose_is_found_once_for_every_half_second_that_it_is_pushed() -> None:
-    verdicts = feed([report(i, commanded=(0.3, 0.0, 0.0)) for i in range(80)])
-    assert sum("odometry-frozen" in names(v) for v in verdicts) == 3
 
 
 def test_a_robot_that_was_stopped_in_a_silence_has_no_two_speeds() -> None:

@@ -87,14 +87,6 @@ def test_an_interval_counts_like_the_increments_that_it_is_made_of() -> None:
     assert whole.white == pytest.approx(small[100].white, abs=1e-12)
 
 
-def test_between_two_nodes_the_chain_is_straight() -> None:
-    nodes = arc((0.0, 0.0, 0.0), NONE)
-    found = pose_chain.at(nodes, 25 * STEP_NS // 2)
-    assert found is not None
-    assert found.x_m == pytest.approx((nodes[12].x_m + nodes[13].x_m) / 2)
-    assert found.white[5] == pytest.approx((nodes[12].white[5] + nodes[13].white[5]) / 2)
-
-
 def test_before_its_beginning_the_chain_knows_nothing() -> None:
     assert pose_chain.at(arc((0.0, 0.0, 0.0), NONE), -1) is None
     assert pose_chain.at([], 0) is None

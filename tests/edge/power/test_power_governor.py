@@ -17,8 +17,8 @@ from edge.power.governor.average import PowerHistory
 from edge.power.governor.governor import LEVELS, Governor, GovernorConfig, GovernorInputs, GovernorOutputs
 from edge.power.governor.levels import GenerationTimes, LevelEstimator, Levels, pause_for, worst_share
 from edge.power.governor.plan import PowerModel, power_plan
+from edge.reasoning.generation_cycle import UNLIMITED
 from edge.safety.faults.table import FAULTS
-from edge.state.reasoning_budget import UNLIMITED
 from tools.bench.governor import LOADS, judge, orin, simulate
 
 SECOND = 1_000_000_000

@@ -26,9 +26,10 @@ from edge.reasoning.generation_cycle import (
     FrameMissed,
     GenerationCycle,
     Mode,
+    ReasoningBudget,
     ReasoningConfig,
+    seen_standing,
 )
-from edge.state.reasoning_budget import ReasoningBudget
 
 TOKENS = 8
 ENDS = ("anchored", "missed", "cancelled", "failed", "finished", "nothing")
@@ -66,32 +67,25 @@ BUDGETS = st.builds(
     pause_s=st.sampled_from([0.0, 0.0, 3.0]),
     max_new_tokens=st.sampled_from([None, None, 0, 3, TOKENS, 50]),
 )
-DRAWS = st.builds(
-    Draw,
-    wait_ms=st.sampled_from([0, 10, 100, 400, 600, 20_000]),
-    new_frame=st.sampled_from([True, True, False]),
-    moved_m=st.sampled_from([0.0, 0.0, 0.5]),
-    budget=BUDGETS,
-    new_request=st.sampled_from([False] * 5 + [True]),
-    stopping=st.sampled_from([False] * 9 + [True]),
-    event=st.sampled_from(ENDS),
-    delay_ms=st.sampled_from([0, 50, 900]),
-    new_tokens=st.integers(0, TOKENS),
-    has_waypoints=st.booleans(),
-)
+CHOICES: dict[str, st.SearchStrategy[object]] = {
+    "wait_ms": st.sampled_from([0, 10, 100, 400, 600, 20_000]),
+    "new_frame": st.sampled_from([True, True, False]),
+    "moved_m": st.sampled_from([0.0, 0.0, 0.5]),
+    "budget": BUDGETS,
+    "new_request": st.sampled_from([False] * 5 + [True]),
+    "stopping": st.sampled_from([False] * 9 + [True]),
+    "event": st.sampled_from(ENDS),
+    "delay_ms": st.sampled_from([0, 50, 900]),
+    "new_tokens": st.integers(0, TOKENS),
+    "has_waypoints": st.booleans(),
+}
+DRAWS = st.builds(Draw, **CHOICES)
+HEALTHY: dict[str, object] = {"new_frame": True, "moved_m": 0.0, "budget": ReasoningBudget(), "new_request": False}
 FAILING = st.builds(
-    Draw,
-    wait_ms=st.integers(300, 20_000),
-    new_frame=st.just(True),
-    moved_m=st.just(0.0),
-    budget=st.just(ReasoningBudget()),
-    new_request=st.just(False),
-    stopping=st.just(False),
-    event=st.just("failed"),
-    delay_ms=st.just(0),
-    new_tokens=st.just(0),
-    has_waypoints=st.just(False),
-)
+    lambda wait_ms: Draw(wait_ms, **HEALTHY, stopping=False, event="failed", delay_ms=0, new_tokens=0,
+                         has_waypoints=False),  # type: ignore[arg-type]
+    st.integers(300, 20_000),
+)  # fmt: skip
 MODES = st.sampled_from(list(Mode))
 
 
@@ -303,3 +297,40 @@ def test_an_age_of_a_frame_that_cannot_be_is_refused(offsets: tuple[float, ...])
 def test_a_negative_text_length_is_refused() -> None:
     with pytest.raises(ValueError, match="max_new_tokens"):
         ReasoningConfig((0.0,), -1)
+
+
+# Sync mode: which frame may be the newest of a generation
+
+HALT_NS = 5_000_000_000
+TICK_NS = 100_000_000
+
+
+def frames(after_ns: int, moved: SE2) -> list[tuple[int, SE2]]:
+    """Two of them, 0.1 s apart, the newest so long after the halt."""
+    there = SE2(3.0, -2.0, 2.5)
+    return [(HALT_NS + after_ns - TICK_NS, there), (HALT_NS + after_ns, there @ moved)]
+
+
+STILL = SE2(0.0, 0.0, 0.0)
+COASTS = SE2(0.05, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("seen", "halted_ns", "stands"),
+    [
+        (frames(3 * TICK_NS, STILL), HALT_NS, True),
+        (frames(3 * TICK_NS, SE2(0.009, 0.0, 0.0)), HALT_NS, True),  # 0.1 m/s
+        (frames(3 * TICK_NS, SE2(0.011, 0.0, 0.0)), HALT_NS, False),
+        (frames(3 * TICK_NS, SE2(0.0, -0.011, 0.0)), HALT_NS, False),
+        (frames(3 * TICK_NS, SE2(0.0, 0.0, -0.019)), HALT_NS, True),  # 0.2 rad/s
+        (frames(3 * TICK_NS, SE2(0.0, 0.0, 0.021)), HALT_NS, False),
+        (frames(-1, STILL), HALT_NS, False),  # from before the halt
+        (frames(10 * TICK_NS - 1, COASTS), HALT_NS, False),
+        (frames(10 * TICK_NS, COASTS), HALT_NS, True),  # 1 s after the halt, whatever odometry reports
+        (frames(TICK_NS, STILL)[1:], HALT_NS, False),  # one frame gives no speed
+        (frames(0, COASTS), None, True),  # no halt
+        ([], None, False),
+    ],
+)
+def test_a_frame_is_of_a_standing_robot(seen: list[tuple[int, SE2]], halted_ns: int | None, stands: bool) -> None:
+    assert seen_standing(seen, halted_ns) is stands

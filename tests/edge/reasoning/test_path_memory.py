@@ -14,9 +14,7 @@ from edge.reasoning.path_memory import (
     CAPACITY,
     FARTHEST_M,
     MAX_POINTS,
-    MOVED_M,
     PERIOD_NS,
-    TOLERANCE_M,
     PathMemory,
     Point,
     simplified,
@@ -71,18 +69,6 @@ def test_with_points_to_spare_no_point_left_out_is_farther_than_the_tolerance(
     legs = list(itertools.pairwise(found)) or [(found[0], found[0])]
     for point in points:
         assert min(distance(point, a, b) for a, b in legs) <= tolerance_m + 1e-9
-
-
-@given(ways)
-def test_the_farthest_points_are_told_first(points: list[Point]) -> None:
-    """A longer telling only adds points."""
-    told = [set(simplified(points, most, 0.1)) for most in (3, 5, 9)]
-    assert told[0] <= told[1] <= told[2]
-
-
-def test_there_is_no_way_of_one_point_between_two_ends() -> None:
-    with pytest.raises(ValueError, match="start and an end"):
-        simplified([(0.0, 0.0), (1.0, 0.0)], 1, 0.1)
 
 
 def test_a_way_out_and_back_is_told_with_its_far_end() -> None:
@@ -146,15 +132,6 @@ def test_a_robot_that_stands_keeps_nothing_new() -> None:
     assert len(memory.points) == 1
 
 
-def test_poses_are_about_a_second_apart() -> None:
-    memory = PathMemory()
-    for stamp_ns, T_odom_base in drive([0.0] * 100):
-        memory.put(stamp_ns, T_odom_base)
-    steps = [math.dist(a, b) for a, b in itertools.pairwise(memory.points)]
-    assert len(memory.points) == 10 and steps == pytest.approx([0.8 * PERIOD_NS / 1e9] * 9)
-    assert min(steps) > MOVED_M
-
-
 @pytest.mark.slow
 def test_hours_are_bounded_and_the_start_is_never_lost() -> None:
     memory, poses = PathMemory(), drive([0.02 * math.sin(tick / 70) for tick in range(30_000)])
@@ -165,18 +142,6 @@ def test_hours_are_bounded_and_the_start_is_never_lost() -> None:
     assert most < CAPACITY
     assert memory.points[0] == (poses[0][1].x_m, poses[0][1].y_m)
     assert memory.way(poses[-1][1])[0] == pytest.approx(way_of([poses[0], poses[-1]])[0])
-
-
-def test_what_is_left_out_of_a_long_way_hardly_bends_it() -> None:
-    poses = drive([0.02 * math.sin(tick / 70) for tick in range(8_000)])
-    memory = PathMemory()
-    for stamp_ns, T_odom_base in poses:
-        memory.put(stamp_ns, T_odom_base)
-    assert len(memory.points) < 600  # of 800 s
-    legs = list(itertools.pairwise(memory.points))
-    for _, pose in poses[::40]:
-        point = (pose.x_m, pose.y_m)
-        assert min(distance(point, a, b) for a, b in legs) < TOLERANCE_M
 
 
 def test_what_is_told_of_a_way_beyond_a_kilometre_has_a_bound() -> None:

@@ -20,7 +20,6 @@ from edge.reasoning.prompt import (
     PromptIds,
     Segment,
     check_instruction,
-    past_motion,
 )
 from edge.state.reasoning_text import Progress
 from edge.state.ring import EncodedFrame
@@ -49,11 +48,6 @@ def text(segment: Segment) -> str:
 def test_each_frame_has_its_segment_oldest_first_and_the_tail_has_none(builder: PromptBuilder) -> None:
     segments = builder.build(FRAMES, "stop at the bench")
     assert [None if s.tokens is None else s.tokens[0, 0, 0] for s in segments] == [0, 1, 2, 3, None]
-
-
-def test_each_frame_segment_has_one_place_for_each_language_token_of_the_frame(builder: PromptBuilder) -> None:
-    segments = builder.build(FRAMES, "stop at the bench")
-    assert [segment.ids.count(IDS.img_context) for segment in segments] == [16, 16, 16, 16, 0]
 
 
 def test_the_instruction_comes_before_the_frames_and_past_motion_after_them(builder: PromptBuilder) -> None:
@@ -101,11 +95,6 @@ def test_a_plan_counts_as_many_text_tokens_as_a_usual_prompt_has(builder: Prompt
 def test_no_way_and_no_progress_is_longer_than_the_longest(points: list[Point], step: int, passed: int) -> None:
     tail = BUILDER.tail(tuple(points), Progress(step, 99, passed))
     assert len(tail.ids) <= len(BUILDER.tail(LONGEST_WAY, LONGEST_BEFORE).ids)
-
-
-def test_past_motion_is_told_oldest_first_with_one_decimal() -> None:
-    assert past_motion(WAY) == "(-4.2, 0.0) (-1.4, 0.3)"
-    assert past_motion(()) == "none"
 
 
 @pytest.mark.parametrize("bad", ["", "  \n ", "x" * 401, "go \udcff"])

@@ -82,7 +82,9 @@ def test_a_thread_that_dies_says_so_once() -> None:
 
     poller = CameraPoller(request, image_px=64, period_ns=10 * MS, timeout_s=0.2, latency_ns=0, on_death=deaths.append)
     poller.start()
-    poller._thread.join(5)
+    deadline = time.monotonic() + 5
+    while not deaths and time.monotonic() < deadline:
+        time.sleep(0.01)
     poller.close()
     assert deaths == ["camera thread died: RuntimeError: the bus is gone"]
 

@@ -29,15 +29,6 @@ def test_without_a_semantic_state_zero_is_sent_and_the_action_expert_is_not_run(
     assert bench.sink.commands == [(8, 0.0, 0.0)]
 
 
-def test_with_a_semantic_state_the_robot_is_driven(bench: Bench) -> None:
-    for _ in range(3):
-        bench.see()
-        bench.think(0)
-        speed, reason = bench.tick()
-    assert reason == "ok"
-    assert speed == pytest.approx(0.5)
-
-
 def test_the_delay_is_now_minus_the_anchor_and_the_offset_is_the_motion_since(bench: Bench) -> None:
     bench.see(x_m=1.0)
     bench.think(0, x_m=1.0)
@@ -94,20 +85,6 @@ def test_a_broken_action_expert_stops_the_robot_and_not_the_loop(bench: Bench) -
     assert bench.tick() == (0.0, "output-not-finite")
 
 
-def test_sequence_numbers_continue_from_the_arming(bench: Bench) -> None:
-    for _ in range(3):
-        bench.see()
-        bench.tick()
-    assert [seq for seq, _, _ in bench.sink.commands] == [8, 9, 10]
-
-
-def test_the_loop_ends_when_the_bridge_has_stopped_the_robot(bench: Bench) -> None:
-    bench.see()
-    bench.sink.state = "stopped"
-    assert bench.loop.run(bench.now_ns, None) == "deadman"
-    assert bench.loop.statistics.ticks == 1
-
-
 def test_a_late_tick_is_counted_and_the_deadlines_it_slept_over_are_skipped(bench: Bench) -> None:
     bench.see()
     send = bench.sink.send_velocity
@@ -152,23 +129,12 @@ def test_a_supervisor_that_has_stopped_the_run_ends_the_loop_after_a_zero(bench:
     assert bench.sink.commands[-1][1:] == (0.0, 0.0)
 
 
-def test_the_watchdog_is_told_of_every_tick_whether_it_was_on_time(bench: Bench) -> None:
-    bench.see()
-
-    def wait(_seconds: float) -> bool:
-        bench.now_ns += PERIOD_NS // 2
-        return len(bench.on_time) == 3
-
-    bench.stop.wait = wait  # type: ignore[method-assign,assignment]
-    bench.loop.run(bench.now_ns, None)
-    assert bench.on_time == [True, True, True]
-
-
 @pytest.mark.parametrize(("cause", "fault"), sorted(FAULT_OF_CAUSE.items()))
-def test_what_the_bridge_stopped_for_is_told_as_a_fault_of_the_table(bench: Bench, cause: str, fault: str) -> None:
+def test_a_bridge_that_has_stopped_the_robot_ends_the_loop_with_the_fault(bench: Bench, cause: str, fault: str) -> None:
     bench.see()
     bench.sink.state, bench.sink.cause = "stopped", cause
-    bench.loop.run(bench.now_ns, None)
+    assert bench.loop.run(bench.now_ns, None) == "deadman"
+    assert bench.loop.statistics.ticks == 1
     assert bench.loop.ended_by == "bridge"
     assert bench.loop.supervision.active[0] == fault
 

@@ -1,4 +1,4 @@
-"""New instructions for a runner that drives: a local socket that takes good ones and answers everybody."""
+"""New instructions for a runner that drives: a local socket accepts good ones and answers every sender."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def path(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def told(path: Path) -> Iterator[InstructionSocket]:
+def channel(path: Path) -> Iterator[InstructionSocket]:
     one = open_socket(path)
     yield one
     one.close()
@@ -50,24 +50,20 @@ def line(text: str) -> bytes:
     return json.dumps({"instruction": text}).encode()
 
 
-def test_only_its_user_may_write(told: InstructionSocket, path: Path) -> None:
+def test_an_instruction_arrives_in_one_line_over_a_socket_for_its_user_alone(
+    channel: InstructionSocket, path: Path
+) -> None:
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
-
-
-def test_nothing_there_is_nothing_and_takes_no_time(told: InstructionSocket) -> None:
-    assert told.poll() is None
-
-
-def test_an_instruction_arrives_in_one_line(told: InstructionSocket, path: Path) -> None:
+    assert channel.poll() is None
     send(path, line("walk  to the\nvending machine"))
-    assert told.poll() == "walk to the vending machine"
-    assert told.poll() is None
+    assert channel.poll() == "walk to the vending machine"
+    assert channel.poll() is None
 
 
-def test_of_several_the_newest_counts(told: InstructionSocket, path: Path) -> None:
+def test_of_several_the_newest_counts(channel: InstructionSocket, path: Path) -> None:
     for text in ("one", "two", "three"):
         send(path, line(text))
-    assert told.poll() == "three"
+    assert channel.poll() == "three"
 
 
 @pytest.mark.parametrize(
@@ -75,17 +71,17 @@ def test_of_several_the_newest_counts(told: InstructionSocket, path: Path) -> No
     [b"", b"\xff", b"[]", b'"walk"', b'{"instruction": 3}', b'{"instruction": "a", "speed": 1}', line(" "),
      line("x" * 401), line("word " * 21), b"{" * MAX_BYTES, b"x" * (MAX_BYTES + 1)],
 )  # fmt: skip
-def test_what_is_no_instruction_changes_nothing(told: InstructionSocket, path: Path, data: bytes) -> None:
+def test_what_is_no_instruction_changes_nothing(channel: InstructionSocket, path: Path, data: bytes) -> None:
     send(path, line("go on"))
     send(path, data)
-    assert told.poll() == "go on"
+    assert channel.poll() == "go on"
 
 
 def test_markup_of_the_prompt_stays_text() -> None:
     assert parse(line("stop<|im_end|>")) == "stop<|im_end|>"
 
 
-def test_a_path_that_somebody_holds_is_refused(told: InstructionSocket, path: Path) -> None:
+def test_a_path_that_somebody_holds_is_refused(channel: InstructionSocket, path: Path) -> None:
     with pytest.raises(OSError, match="expected a free path"):
         open_socket(path)
 
@@ -94,6 +90,7 @@ def test_what_a_killed_runner_left_is_taken_over(path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as dead:
         dead.bind(str(path))
     open_socket(path).close()
+    assert not path.exists(), "closed, it leaves nothing"
 
 
 def test_a_file_of_somebody_is_left_alone(path: Path) -> None:
@@ -103,22 +100,17 @@ def test_a_file_of_somebody_is_left_alone(path: Path) -> None:
     assert path.read_text(encoding="utf-8") == "mine"
 
 
-def test_closed_it_leaves_nothing(path: Path) -> None:
-    open_socket(path).close()
-    assert not path.exists()
-
-
 @pytest.fixture
 def runner(path: Path) -> Iterator[list[str]]:
-    """Somebody who polls, as the runner's main thread does."""
-    heard: list[str] = []
+    """Instructions received by a thread that polls as the runner's main thread does."""
+    received: list[str] = []
     end = threading.Event()
 
     def poll() -> None:
         one = open_socket(path)
         while not end.is_set():
             text = one.poll()
-            heard.extend([] if text is None else [text])
+            received.extend([] if text is None else [text])
             end.wait(0.01)
         one.close()
 
@@ -126,17 +118,17 @@ def runner(path: Path) -> Iterator[list[str]]:
     thread.start()
     while not path.exists():
         time.sleep(0.005)
-    yield heard
+    yield received
     end.set()
     thread.join()
 
 
-def test_edge_say_tells_what_was_accepted(runner: list[str], path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_edge_say_reports_what_was_accepted(runner: list[str], path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert say.main(["turn  left", "--to", str(path)]) == 0
     assert capsys.readouterr().out == "turn left\n" and runner == ["turn left"]
 
 
-def test_edge_say_tells_why_one_is_refused(runner: list[str], path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_edge_say_reports_why_one_is_refused(runner: list[str], path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert say.main(["word " * 30, "--to", str(path)]) == 1
     assert "too long for the model" in capsys.readouterr().err and runner == []
 

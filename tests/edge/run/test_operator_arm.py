@@ -57,13 +57,6 @@ class TestBridge:
         assert bench.status.blocked_by == "none"
         bench.arm()
 
-    def test_it_is_answered_in_words_after_a_refusal(self) -> None:
-        bench = bench_of().permit()
-        assert (bench.status.cause, bench.status.reason) == (
-            "none",
-            "permitted by an operator, waiting for the runner to arm",
-        )
-
     @pytest.mark.parametrize("end", ["client stops", "client goes", "deadman", "robot falls silent"])
     def test_it_serves_one_arming_whatever_ends_it(self, end: str) -> None:
         bench = permitted().arm()
@@ -208,12 +201,6 @@ class TestRunner:
         assert runner.waited == sorted(runner.waited, key=(WAITING, ARMING).index)
         assert len(runner.waited) >= 0.9 * runner.now_ms / 50
 
-    def test_while_it_waits_it_sends_no_commands(self) -> None:
-        runner = Runner()
-        runner.at_ms[60_000] = runner.permit
-        last_seq = runner.run()
-        assert last_seq == runner.bench.seq <= 10
-
     def test_nothing_else_that_is_in_the_way_ends_the_waiting(self) -> None:
         runner = Runner()
         carried = {"pitch_rad": 1.0}
@@ -238,10 +225,13 @@ class TestRunner:
         with pytest.raises(RefusedError, match="not standing after 10 s"):
             runner.run()
 
-    def test_a_signal_ends_the_waiting(self) -> None:
-        runner = Runner()
+    @pytest.mark.parametrize(
+        ("in_the_way", "when"), [("", "waiting to be armed"), ("dark", "before the robot was armed")]
+    )
+    def test_a_signal_ends_the_waiting(self, in_the_way: str, when: str) -> None:
+        runner = Runner(in_the_way=in_the_way)
         runner.at_ms[5_000] = lambda: setattr(runner, "stop", True)
-        with pytest.raises(StoppedEarlyError, match="waiting to be armed"):
+        with pytest.raises(StoppedEarlyError, match=when):
             runner.run()
         assert runner.now_ms < 5_200
 
@@ -306,9 +296,3 @@ class TestInTheWay:
         runner.at_ms[60_000] = runner.permit
         runner.run()
         assert runner.now_ms >= 60_000 and runner.said == ["waiting for `edge-bridge arm`"]
-
-    def test_a_signal_ends_the_waiting_for_it(self) -> None:
-        runner = Runner(in_the_way="dark")
-        runner.at_ms[5_000] = lambda: setattr(runner, "stop", True)
-        with pytest.raises(StoppedEarlyError, match="before the robot was armed"):
-            runner.run()

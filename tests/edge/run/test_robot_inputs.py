@@ -94,7 +94,7 @@ class Rig:
             self.reader.hear(state)
 
     def drive(self, seconds: float) -> None:
-        """Ticks, with a report and a glance every 20 ms."""
+        """Ticks, with a report and a poll_urgent_faults every 20 ms."""
         bench = self.bench
         for _ in range(round(seconds * 1e9 / PERIOD_NS)):
             began_ns = bench.now_ns
@@ -106,7 +106,7 @@ class Rig:
                 bench.now_ns = began_ns + part * REPORT_NS
                 self.report()
                 if not bench.loop.supervision.stop:
-                    bench.loop.glance()
+                    bench.loop.poll_urgent_faults()
 
     @property
     def active(self) -> tuple[str, ...]:
@@ -202,18 +202,17 @@ def test_reports_that_stay_late_limit_the_speed_for_as_long_as_they_do(rig: Rig,
         assert fault in rig.active
 
 
-def test_two_speeds_that_disagree_stop_the_run_within_their_bound(rig: Rig) -> None:
+@pytest.mark.parametrize(
+    ("spin_radps", "alter"),
+    [
+        (0.0, lambda state: replace(state, vx_mps=state.vx_mps + 0.8)),
+        (1.0, lambda state: replace(state, gyro_wz_radps=0.0)),
+    ],
+    ids=["velocity", "a gyro that shows no turn"],
+)
+def test_two_speeds_that_disagree_stop_the_run_within_their_bound(rig: Rig, spin_radps: float, alter: Alter) -> None:
     began_ns = rig.bench.now_ns
-    rig.alter = lambda state: replace(state, vx_mps=state.vx_mps + 0.8)
-    rig.drive(1)
-    assert "odometry-speed-mismatch" in rig.active and rig.bench.loop.supervision.stop
-    assert rig.zero_after_ms(began_ns) <= FAULTS["odometry-speed-mismatch"].bound_ms
-
-
-def test_a_gyro_that_shows_no_turn_while_the_robot_turns_stops_the_run(rig: Rig) -> None:
-    began_ns = rig.bench.now_ns
-    rig.spin_radps = 1.0
-    rig.alter = lambda state: replace(state, gyro_wz_radps=0.0)
+    rig.spin_radps, rig.alter = spin_radps, alter
     rig.drive(1)
     assert "odometry-speed-mismatch" in rig.active and rig.bench.loop.supervision.stop
     assert rig.zero_after_ms(began_ns) <= FAULTS["odometry-speed-mismatch"].bound_ms
@@ -244,6 +243,10 @@ def test_half_of_the_states_lost_from_the_start_limits_the_speed(monkeypatch: py
     rig.drive(2.5)
     assert rig.active == ("link-lossy",)
     assert rig.command[0] == pytest.approx(0.4)
+    few = Rig(monkeypatch)
+    few.alter = every(10, 1)
+    few.drive(6)
+    assert few.active == (), "a tenth is no fault"
 
 
 def test_half_of_the_states_lost_later_is_found_in_time(rig: Rig) -> None:
@@ -252,28 +255,19 @@ def test_half_of_the_states_lost_later_is_found_in_time(rig: Rig) -> None:
     assert "link-lossy" in rig.active
 
 
-def test_a_tenth_of_the_states_lost_from_the_start_is_no_fault(monkeypatch: pytest.MonkeyPatch) -> None:
-    rig = Rig(monkeypatch)
-    rig.alter = every(10, 1)
-    rig.drive(6)
-    assert rig.active == ()
-
-
-def test_a_picture_is_seen_with_the_attitude_of_its_own_instant(rig: Rig) -> None:
+def test_a_picture_is_seen_with_the_attitude_of_its_own_instant(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[Attitude] = []
+    eye = SimpleNamespace(step=lambda grey, stamp_ns, attitude: seen.append(attitude))
+    poller: dict[str, Callable[[Frame], None]] = {}
+    monkeypatch.setattr(robot_inputs, "VisualOdometry", lambda _geometry: eye)
+    monkeypatch.setattr(robot_inputs, "CameraPoller", lambda _request, **named: poller.update(see=named["on_frame"]))
+    rig = Rig(monkeypatch)
     began_ns = rig.bench.now_ns
     rig.alter = lambda state: replace(state, pitch_rad=(state.received_ns - began_ns) / 1e9)
     rig.drive(0.3)
-    rig.inputs._eye = SimpleNamespace(step=lambda grey, stamp_ns, attitude: seen.append(attitude))  # type: ignore[assignment]
     jpeg = cv2.imencode(".jpg", np.full((48, 64, 3), 90, dtype=np.uint8))[1].tobytes()
-    rig.inputs._see(Frame(began_ns + 150 * MS, np.zeros((1, 32, 32, 3), dtype=np.uint8), jpeg))
+    poller["see"](Frame(began_ns + 150 * MS, np.zeros((1, 32, 32, 3), dtype=np.uint8), jpeg))
     assert [one.pitch_rad for one in seen] == [pytest.approx(0.15)]
-
-
-def test_whoever_drives_is_told_that_a_thread_has_died(rig: Rig) -> None:
-    rig.reader.on_death("robot state thread died: test")
-    rig.inputs.camera._on_death("camera thread died: test")
-    assert rig.deaths == ["robot state thread died: test", "camera thread died: test"]
 
 
 class FakeBus:

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from edge.deploy.install import main as install_main
 from edge.reasoning.prompt import InstructionError
 from edge.run.arming import disarm
+from edge.run.command import main as run_main
 from edge.run.instructions import InstructionSocket, check_first_instruction
 from edge.run.stop_phrase import COMPANIONS, STOP_WORDS, is_stop_phrase
-from edge.runner import main as run_main
 from firmware_bridge.client import BridgeStatus, BridgeUnavailable
 from firmware_bridge.core.link import Stop
 from tests.support.processes import GO2_SIM

@@ -25,8 +25,11 @@ def test_every_row_of_the_matrix_is_in_the_table_or_has_a_reason_not_to_be() -> 
 
 @pytest.mark.parametrize("fault", ROWS, ids=lambda fault: fault.name)
 def test_the_test_that_injects_a_fault_exists(fault: Fault) -> None:
-    file, *names = fault.test_id.split("::")
-    body = ast.parse((ROOT / file).read_text(encoding="utf-8")).body
+    node, _, case = fault.test_id.removesuffix("]").partition("[")
+    file, *names = node.split("::")
+    text = (ROOT / file).read_text(encoding="utf-8")
+    assert not case or any(f'"{name}"' in text for name in (case, case.split()[0])), f"{file} has no case {case}"
+    body = ast.parse(text).body
     for name in names:
         found = [node for node in body if isinstance(node, ast.FunctionDef | ast.ClassDef) and node.name == name]
         assert found, f"{file} has no {name}"

@@ -43,17 +43,6 @@ from edge.state.reasoning_text import (
 tenths = st.integers(-999, 999).map(lambda n: n / 10)
 
 
-@given(st.lists(st.tuples(tenths, tenths), min_size=3, max_size=3))
-def test_written_waypoints_are_read_back(points: list[tuple[float, float]]) -> None:
-    waypoints = tuple(points)
-    assert parse_waypoints("The way is clear.\n" + format_waypoints(waypoints)) == waypoints
-
-
-@given(st.text(max_size=300))
-def test_any_other_text_is_no_waypoints_and_no_error(text: str) -> None:
-    assert parse_waypoints(text) is None
-
-
 @pytest.mark.parametrize(
     "text",
     [
@@ -72,11 +61,6 @@ def test_any_other_text_is_no_waypoints_and_no_error(text: str) -> None:
 )
 def test_near_misses_are_invalid(text: str) -> None:
     assert parse_waypoints(text) is None
-
-
-def test_text_beyond_the_cap_is_not_read() -> None:
-    line = format_waypoints(((1.0, 0.0), (2.0, 0.0), (3.0, 0.0)))
-    assert parse_waypoints("x" * MAX_TEXT_CHARS + "\n" + line) is None
 
 
 def test_the_longest_line_of_the_grammar_is_read() -> None:
@@ -153,23 +137,10 @@ def all_progress() -> st.SearchStrategy[Progress]:
     )
 
 
-@given(all_progress())
-def test_written_progress_is_read_back_and_is_the_only_way_to_write_it(progress: Progress) -> None:
-    text = f"Objects: bench left 2 m.\nProgress: {format_progress(progress)}\nPlan: go straight.\n"
-    assert parse_progress(text) == progress
-    assert len(format_progress(progress)) <= MAX_PROGRESS_CHARS
-
-
 def test_progress_is_told_in_these_words() -> None:
     assert format_progress(Progress(2, 3, 1)) == "turn 2 of 3, passed 1."
     assert format_progress(Progress(4, 3, 0)) == "last leg of 3, passed 0."
     assert format_progress(Progress(1, 0, 0)) == "last leg of 0, passed 0."
-
-
-@given(st.text(max_size=300))
-def test_any_other_text_says_no_progress_and_is_no_error(text: str) -> None:
-    assert parse_progress(text) is None
-    assert parse_progress(f"Progress: {text}") is None or text.startswith(("turn ", "last leg of "))
 
 
 @pytest.mark.parametrize(
@@ -233,13 +204,9 @@ TEXTS = st.builds(
 
 @given(TEXTS)
 def test_parsing_is_the_inverse_of_formatting_for_any_parts(parts: ReasoningText) -> None:
-    assert parse_text(format_text(parts)) == parts
-
-
-@given(TEXTS)
-def test_a_formatted_text_is_the_only_form_of_its_parts(parts: ReasoningText) -> None:
     text = format_text(parts)
-    assert format_text(parse_text(text)) == text
+    assert parse_text(text) == parts and format_text(parse_text(text)) == text
+    assert parts.progress is None or len(format_progress(parts.progress)) <= MAX_PROGRESS_CHARS
 
 
 PIECES = st.sampled_from(("Plan: ", "Objects: ", "Situation: ", "Motion: ", "\n", ".", ", ")) | st.text(max_size=9)

@@ -58,13 +58,6 @@ def encoded(ring: TokenRing, number: int) -> EncodedFrame:
     return frame
 
 
-def test_a_slot_keeps_its_buffer() -> None:
-    ring = TokenRing(3, shape=(1, 4, 8))
-    frames = [encoded(ring, number) for number in range(6)]
-    assert [frames[i].tokens is frames[i + 3].tokens for i in range(3)] == [True] * 3
-    assert len({id(frame.tokens) for frame in frames}) == 3
-
-
 def test_tokens_given_to_a_reader_survive_the_slots_next_frame() -> None:
     ring = TokenRing(2, shape=(1, 4, 8))
     encoded(ring, 1)

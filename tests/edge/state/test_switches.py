@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edge import runner
 from edge.core.geometry import SE2
 from edge.motion.recovery import ARRIVED
 from edge.reasoning.decoding_rules import FREE, DecodingContext, TextConstraint
 from edge.reasoning.instruction_state import InstructionMemory
+from edge.run import command as runner
 from edge.state.ring import EncodedFrame
 from edge.state.switches import Decoding, RecoverySwitch, Switches, SwitchOptions
 from firmware_bridge.core.config import ConfigError
@@ -22,7 +22,7 @@ CONSTRAINED, ON, OFF = Decoding.CONSTRAINED, RecoverySwitch.ON, RecoverySwitch.O
 def asked(*arguments: str) -> SwitchOptions:
     """Switches that the runner's command line asks for."""
     command = ["--artifacts", "a", "--robot", str(ROBOT_FILE), "--instruction", "stop at the desk", *arguments]
-    return runner._read(runner.parser().parse_args(command))[1].switches
+    return runner.read_options(runner.parser().parse_args(command))[1].switches
 
 
 def in_force(*arguments: str, recovery: RecoverySwitch = ON) -> Switches:

@@ -136,8 +136,10 @@ class Stack:
 
     def drive(self, ready: str = "driving") -> object:
         where = ("--robot", GO2_SIM, "--socket", self.bridge, "--domain", self.domain)
-        told = ("--instruction", "walk down the corridor", "--instructions", self.instructions)
-        return running("edge.runner", "--artifacts", self.artifacts, *where, *told, folder=self.folder, ready=ready)
+        texts = ("--instruction", "walk down the corridor", "--instructions", self.instructions)
+        return running(
+            "edge.run.command", "--artifacts", self.artifacts, *where, *texts, folder=self.folder, ready=ready
+        )
 
     def say(self, text: str) -> subprocess.CompletedProcess[str]:
         return say(text, "--to", self.instructions, folder=self.folder)

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from edge.core.geometry import SE2
-from edge.odometry.estimator import DriftEstimator, OdometryInputs, OdometryOutputs
+from edge.odometry.estimator import DriftEstimator, OdometryOutputs
+from edge.odometry.gate import OdometryInputs
 from edge.odometry.visual_odometry import VisualMotion
 
 STATE_NS = 20_000_000

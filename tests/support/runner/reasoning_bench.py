@@ -16,10 +16,9 @@ from edge.inference.graph import CancelledError, GraphError, Interrupt
 from edge.inference.language import Generation
 from edge.inference.scheduling import Role
 from edge.reasoning.decoding_rules import DecodingContext, TurnObservation
-from edge.reasoning.generation_cycle import Mode, ReasoningConfig
+from edge.reasoning.generation_cycle import Mode, ReasoningBudget, ReasoningConfig
 from edge.reasoning.path_memory import Way
 from edge.run.reasoning_loop import ReasoningLoop, ReasoningOutputs, ReasoningSchedule
-from edge.state.reasoning_budget import ReasoningBudget
 from edge.state.reasoning_text import Progress
 from edge.state.ring import EncodedFrame, TokenRing
 from edge.state.semantic import SemanticSlot, SharedState
@@ -143,13 +142,14 @@ class Bench:
         decoding: Decoding = Decoding.CONSTRAINED,
         late_anchor: bool = True,
         give_way: object = None,
+        stop: threading.Event | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self.language = FakeLanguage()
         self.policy = FakePolicy()
         self.ring = TokenRing(256)
         self.slot = SemanticSlot()
-        self.stop = threading.Event()
+        self.stop = stop or threading.Event()
         self.budget = ReasoningBudget()
         self.said: list[str] = []
         self.records: list[dict[str, object]] = []

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.core.geometry import SE2
-from edge.reasoning.path_memory import told_point
+from edge.reasoning.path_memory import prompt_point
 from tools.train.config.sft import AROUND, ShowConfig
 from tools.train.samples.anchors import Anchor, frames_at
 from tools.train.samples.language_batch import Halves
@@ -29,7 +29,7 @@ def shifted(anchor: Anchor, config: ShowConfig, rng: np.random.Generator) -> Anc
     return replace(
         anchor,
         k=anchor.k + by,
-        way=tuple(told_point(T_shown_anchor @ SE2(x_m, y_m, 0.0)) for x_m, y_m in anchor.way),
+        way=tuple(prompt_point(T_shown_anchor @ SE2(x_m, y_m, 0.0)) for x_m, y_m in anchor.way),
         frames=_jittered(frames_at(anchor.k + by), jitter),
         points=points,
         reasoning=replace(anchor.reasoning, waypoints=points),

@@ -28,7 +28,6 @@ from edge.core.cli import (
     command_line,
     write_result,
 )
-from edge.core.terminal import operator_lines
 from edge.flightlog.reader import parts
 from edge.inference import engines
 from edge.inference.release import ReleaseDelayError, parse_release_delay
@@ -38,6 +37,7 @@ from edge.reasoning.prompt import InstructionError
 from edge.run.arming import RefusedError, StoppedEarlyError
 from edge.run.assembly import RunOptions
 from edge.run.instructions import check_first_instruction
+from edge.run.service import operator_lines
 from edge.run.session import RunSession
 from edge.state.switches import Decoding, RecoverySwitch, SwitchOptions
 from firmware_bridge.client import BridgeUnavailable
@@ -131,7 +131,7 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
-def _read(args: argparse.Namespace) -> tuple[RobotConfig, RunOptions]:
+def read_options(args: argparse.Namespace) -> tuple[RobotConfig, RunOptions]:
     """Everything that can be refused without looking at the robot or the artifacts."""
     if args.duration is not None and not (math.isfinite(args.duration) and args.duration > 0):
         raise ConfigError(f"--duration {args.duration}: expected a positive number of seconds")
@@ -189,7 +189,7 @@ def _run(args: argparse.Namespace, say: Callable[[str], None], sessions: list[Ru
             session.request_stop()
 
     try:
-        robot, options = _read(args)
+        robot, options = read_options(args)
         trust = None if args.trust is None else Trust(args.trust, args.state / "release.json")
         artifacts = load_artifacts(args.artifacts.absolute(), trust)
         # Before anything moves: a provider without its engine would compile for minutes while the robot drives.

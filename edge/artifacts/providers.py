@@ -1,12 +1,16 @@
-"""Device nodes that an execution provider computes through, as they are on this machine (facts: edge hardware, 2).
+"""Execution providers: the options that a manifest may give them, and the device nodes that they compute through.
 
-The list for a Jetson is read in public sources, one named on each line. It was not tested on a board.
+Some providers load code from a path in their options (TensorRT's plug-ins, a CUDA graph's external libraries), and a
+data file of an artifact directory may hold anything: so no option names a file. The folders of engines come from
+`edge.inference.engines`. The nodes of a Jetson are read in public sources, one named on each line (facts: edge
+hardware, 2); they were not tested on a board.
 """
 
 from __future__ import annotations
 
 import grp
 import os
+import re
 import stat
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,6 +18,34 @@ from pathlib import Path
 from typing import Final
 
 from edge.core.device import CUDA, OPENVINO, TENSORRT
+
+ALLOWED: Final[Mapping[str, frozenset[str]]] = {
+    TENSORRT: frozenset({
+        "trt_builder_optimization_level", "trt_context_memory_sharing_enable", "trt_engine_cache_enable",
+        "trt_fp16_enable", "trt_int8_enable", "trt_layer_norm_fp32_fallback", "trt_max_workspace_size",
+        "trt_profile_max_shapes", "trt_profile_min_shapes", "trt_profile_opt_shapes", "trt_timing_cache_enable",
+    }),
+    CUDA: frozenset({
+        "arena_extend_strategy", "cudnn_conv_algo_search", "cudnn_conv_use_max_workspace",
+        "do_copy_in_default_stream", "gpu_mem_limit", "prefer_nhwc", "use_tf32",
+    }),
+    OPENVINO: frozenset({"device_type", "num_of_threads", "num_streams", "precision"}),
+}  # fmt: skip
+"""Those of the shipped targets, and others of their kind for targets of one's own."""
+_VALUE: Final = re.compile(r"[A-Za-z0-9_.:,+-]{0,4096}", re.ASCII)
+
+
+def wrong_option(provider: str, options: Mapping[str, str]) -> str | None:
+    """Return what is wrong with the options of a provider, for a message; None if nothing is."""
+    allowed = ALLOWED.get(provider, frozenset())
+    for key, value in options.items():
+        if key not in allowed:
+            return f"option {key!r} of {provider} is not one that the runner passes on; expected " + (
+                ", ".join(sorted(allowed)) or "none"
+            )
+        if not _VALUE.fullmatch(value) or ".." in value:
+            return f"option {key} is {value[:80]!r}; expected a number, a choice or shapes, and no path"
+    return None
 
 
 @dataclass(frozen=True)
@@ -54,7 +86,7 @@ class DeviceNode:
     """One node below /dev."""
 
     path: Path
-    """As the machine names it, without the root that it was looked for in."""
+    """Path on the machine, without the root of the search."""
     group: str | None
     """Group that may open it; None if everybody may, or if only root's group may."""
 
