@@ -73,7 +73,7 @@ class Bridge:
         latch_path: Path,
         groups: SocketGroups = USER_ONLY,
     ) -> None:
-        """`latch_path`: file that keeps an emergency stop over restarts; `groups`: who may use the sockets."""
+        """`latch_path`: file that keeps an emergency stop over restarts; `groups`: users that may use the sockets."""
         self._log = log
         self._notifier = notifier
         self._config = config
@@ -88,11 +88,11 @@ class Bridge:
                 f"--latch {latch_path}: expected a file in an existing folder; create {latch_path.parent}"
             )
         latch = read_latch(latch_path)
-        self._latch_file = LatchFile(latch_path, log.say)
+        self._latch_file = LatchFile(latch_path, log.write)
         self._core = BridgeCore(config.bridge, config.limits, config.safety, time.monotonic_ns(), latch=latch)
         self._period_ns = 1_000_000_000 // config.bridge.rate_hz
         self._wake_ns = self._pinged_ns = time.monotonic_ns()
-        self._said, self._ready, self._extended_ns = "", False, -_EXTEND_NS
+        self._reported, self._ready, self._extended_ns = "", False, -_EXTEND_NS
 
     @property
     def greeting(self) -> str:
@@ -147,13 +147,13 @@ class Bridge:
         """Join the robot's network as soon as its interface is up; whether that has happened in this call."""
         if not isinstance(self._robot, AbsentRobot) or not is_interface_up(self._robot.interface):
             return False
-        self._robot = RobotLink(self._config, self._log.say)
+        self._robot = RobotLink(self._config, self._log.write)
         settle_memory()
         return True
 
     def _step(self, *, shutdown: bool = False) -> Outputs:
         if self._join_robot():
-            self._log.say(self.greeting)
+            self._log.write(self.greeting)
         asleep_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns()
         messages, operator = self._link.receive(), self._operators.receive()
         robot = self._robot.read(time.monotonic_ns())
@@ -168,9 +168,9 @@ class Bridge:
             outputs = replace(outputs, status=replace(outputs.status, reason=reason))
         if isinstance(self._robot, AbsentRobot):
             outputs = replace(outputs, status=replace(outputs.status, reason=self._robot.reason))
-        self._link.tell(outputs.status)
+        self._link.send_status(outputs.status)
         if latch_is_kept:  # a stop that an operator has seen confirmed must survive a kill
-            self._operators.tell(outputs.status)
+            self._operators.send_status(outputs.status)
         self._report_progress(outputs.status)
         return outputs
 
@@ -182,13 +182,13 @@ class Bridge:
             self._extended_ns = now_ns
 
     def _report_progress(self, status: BridgeStatus) -> None:
-        said = f"{status.state}: {status.reason}"
+        line = f"{status.state}: {status.reason}"
         if not self._ready:
-            self._report_start(said, status.stamp_ns)
-        if said != self._said:
-            self._said = said
-            self._log.say(said)
-            self._notifier.status(said)
+            self._report_start(line, status.stamp_ns)
+        if line != self._reported:
+            self._reported = line
+            self._log.write(line)
+            self._notifier.status(line)
         period_ns, late_ns = self._notifier.watchdog_period_ns, status.stamp_ns - self._wake_ns
         if period_ns is not None and status.stamp_ns - self._pinged_ns >= period_ns and late_ns < _LATE_NS:
             self._pinged_ns = status.stamp_ns
@@ -196,7 +196,7 @@ class Bridge:
 
 
 def is_pressed(path: Path) -> bool:
-    """Whether the emergency stop behind a GPIO value file is pressed: unless the file can be read and says 0."""
+    """Whether the emergency stop behind a GPIO value file is pressed: unless the file can be read and holds 0."""
     try:
         file = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
         try:
@@ -208,7 +208,7 @@ def is_pressed(path: Path) -> bool:
 
 
 def settle_memory() -> None:
-    """Let the garbage collector pass over everything that exists now: later collections look at a step's objects."""
+    """Let the garbage collector pass over everything that exists now: later collections visit a step's objects only."""
     gc.collect()
     gc.freeze()
 
@@ -243,10 +243,10 @@ def serve(config: RobotConfig, latch_path: Path, groups: SocketGroups) -> dict[s
         log = LineLog(sys.stderr, "edge-bridge")
         notifier = Notifier(os.environ)
         bridge = Bridge(config, log, notifier, latch_path, groups)
-        log.say(bridge.greeting)
+        log.write(bridge.greeting)
         settle_memory()
         if (unlocked := lock_memory()) is not None:
-            log.say(unlocked)
+            log.write(unlocked)
         try:
             bridge.run(wakeup)
         finally:

@@ -119,24 +119,46 @@ def _named(what: object) -> Iterator[None]:
         raise OutputError(f"{what}: cannot be written: {error.strerror or error}") from error
 
 
-def command_line(name: str) -> Callable[[Callable[P, int]], Callable[P, int]]:
+def messages(name: str) -> Callable[[str], None]:
+    """Return a function that writes `name: line` to standard error at once."""
+
+    def write(line: str) -> None:
+        sys.stderr.write(f"{name}: {line}\n")
+        sys.stderr.flush()
+
+    return write
+
+
+def command_line(
+    name: str, exits: Mapping[type[Exception], int] | None = None
+) -> Callable[[Callable[P, int]], Callable[P, int]]:
     """Decorate the main function of a command: an output that cannot be written is one line and EXIT_CHECK_FAILED.
 
-    Standard output is flushed here, where its error can still be reported.
+    `exits`: exit codes of other errors, by their type; the first that fits counts, its text is the one line. Standard
+    output is flushed here, where its error can still be reported. An interrupted command is one line and
+    EXIT_INTERRUPTED.
     """
+    codes, report = dict(exits or {}), messages(name)
 
     def decorate(main: Callable[P, int]) -> Callable[P, int]:
         @functools.wraps(main)
         def run(*args: P.args, **kwargs: P.kwargs) -> int:
             try:
-                code = main(*args, **kwargs)
+                try:
+                    code = main(*args, **kwargs)
+                except tuple(codes) as error:
+                    report(str(error))
+                    code = next(code for kind, code in codes.items() if isinstance(error, kind))
+                except KeyboardInterrupt:
+                    report("interrupted")
+                    code = EXIT_INTERRUPTED
                 with _named("standard output"):
                     sys.stdout.flush()
                 return code
             except (OutputError, OSError) as error:
                 if isinstance(error, OSError) and error.errno not in (errno.ENOSPC, errno.EPIPE):
                     raise
-                sys.stderr.write(f"{name}: {error}\n")
+                report(str(error))
                 _give_up_stdout()
                 return EXIT_CHECK_FAILED
 

@@ -14,10 +14,10 @@ from edge.artifacts.trust import KeyFileError
 from edge.core.cli import (
     EXIT_BAD_INPUT,
     EXIT_DONE,
-    EXIT_INTERRUPTED,
     EXIT_REFUSED,
     check_result_target,
     command_line,
+    messages,
     write_result,
 )
 from edge.deploy import dds_binding, install_units
@@ -34,7 +34,8 @@ EXAMPLES = """examples:
        --instruction-file /etc/tic-vla/instruction.txt --network 192.168.123.161/32 --system
   edge-install dds
 
-units wants a robot file with operator_arm = true in [safety], or --arm-at-start.
+units needs a robot file with operator_arm = true in [safety], or --arm-at-start. An interrupted build of engines keeps
+the finished ones: run it again to go on.
 
 exit codes: 0 done, 1 systemd finds fault with the units, 2 bad arguments or input, 3 refused (artifacts, device),
             130 interrupted
@@ -63,33 +64,28 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
-def _say(line: str) -> None:
-    sys.stderr.write(f"edge-install: {line}\n")
-    sys.stderr.flush()
+_print = messages("edge-install")
 
 
-@command_line("edge-install")
+@command_line(
+    "edge-install",
+    {
+        ArtifactError: EXIT_REFUSED,
+        engines.EngineError: EXIT_REFUSED,
+        **dict.fromkeys((OSError, ConfigError, InstructionError, KeyFileError, UnitError), EXIT_BAD_INPUT),
+    },
+)
 def main(
     argv: Sequence[str] | None = None, machine: engines.Machine | None = None, host: install_units.Host | None = None
 ) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
     if args.command == "dds":
-        return dds_binding.run(args, _say)
-    try:
-        check_result_target(args.json)
-        if args.command == "units":
-            return install_units.run(args, _say, host)
-        return _build_engines(args, machine)
-    except (ArtifactError, engines.EngineError) as error:
-        _say(str(error))
-        return EXIT_REFUSED
-    except (OSError, ConfigError, InstructionError, KeyFileError, UnitError) as error:
-        _say(str(error))
-        return EXIT_BAD_INPUT
-    except KeyboardInterrupt:
-        _say("interrupted; what was finished is kept, run it again to go on")
-        return EXIT_INTERRUPTED
+        return dds_binding.run(args, _print)
+    check_result_target(args.json)
+    if args.command == "units":
+        return install_units.run(args, _print, host)
+    return _build_engines(args, machine)
 
 
 def _build_engines(args: argparse.Namespace, machine: engines.Machine | None) -> int:
@@ -97,12 +93,12 @@ def _build_engines(args: argparse.Namespace, machine: engines.Machine | None) ->
     directory = args.artifacts.absolute()
     where = args.engines.absolute() if args.engines is not None else engines.default_directory(directory)
     if where == directory or directory in where.parents:
-        _say(f"--engines {args.engines}: lies inside the artifact directory, which is sealed; name another")
+        _print(f"--engines {args.engines}: lies inside the artifact directory, which is sealed; name another")
         return EXIT_BAD_INPUT
     artifacts = load_artifacts(directory)
-    graphs = engines.build(artifacts, where, _say, machine)
+    graphs = engines.build(artifacts, where, _print, machine)
     if not graphs:
-        _say(f"{artifacts.target}: no graph needs an engine")
+        _print(f"{artifacts.target}: no graph needs an engine")
     wall_s = round((time.monotonic_ns() - started_ns) / 1e9, 3)
     write_result(args.json, {"engines": str(where), "graphs": graphs, "wall_s": wall_s})
     return EXIT_DONE

@@ -39,7 +39,7 @@ def odometry_record(
     drift: DriftRate | None,
     command: tuple[float, float, float] | None,
 ) -> dict[str, Any]:
-    """`/odometry`: what the robot reported, what was made of it, and the velocity it had been told."""
+    """`/odometry`: what the robot reported, what was made of it, and the last commanded velocity."""
     rad_per_m = None if drift is None else drift.rad_per_m
     return {
         "raw_pose": state.T_odom_base,

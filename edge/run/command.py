@@ -169,7 +169,7 @@ def main(argv: list[str] | None = None) -> int:
     lines = operator_lines("edge-run")
     try:
         sessions: list[RunSession] = []
-        code = _run(args, lines.say, sessions)
+        code = _run(args, lines.write, sessions)
     finally:
         lines.close(LINES_S)
     if any(session.hung for session in sessions):

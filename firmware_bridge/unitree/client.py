@@ -24,7 +24,7 @@ _JPEG_START: Final = b"\xff\xd8"
 
 
 class CameraError(RuntimeError):
-    """No usable camera frame; one line that says why."""
+    """No usable camera frame; one line with the reason."""
 
 
 class Go2Reader:
@@ -35,7 +35,7 @@ class Go2Reader:
     ) -> None:
         """`bus`: use an already open participant (DDS allows one per domain and process).
 
-        `on_death` is told, once and in the reading thread, why that has ended although nobody closed it.
+        `on_death` gets the reason once, in the reading thread, when that ends although nobody closed the reader.
         """
         self.malformed = 0
         """States that were dropped because something in them cannot be."""
@@ -72,7 +72,7 @@ class Go2Reader:
     def battery(self) -> BatteryState | None:
         """The battery as of at most 0.5 s ago, None before the first report; any thread, never waits.
 
-        The robot does not say when it measured: judge the age by `received_ns`.
+        The robot does not report when it measured: judge the age by `received_ns`.
         """
         return self._battery
 

@@ -32,7 +32,7 @@ def test_every_command_has_help_with_examples_and_exit_codes(module: str) -> Non
     assert "exit codes:" in done.stdout
 
 
-def test_a_part_whose_packages_are_missing_says_how_to_get_them(
+def test_a_part_with_missing_packages_names_the_command_that_installs_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "needs_much.py").write_text("import package_that_is_not_installed\n")
@@ -50,12 +50,6 @@ def test_a_result_is_written_whole_and_nothing_else_is_left(tmp_path: Path) -> N
     write_result(str(target), {"a": 1})
     assert json.loads(target.read_text()) == {"a": 1}
     assert [p.name for p in target.parent.iterdir()] == ["result.json"]
-
-
-def test_a_dash_writes_to_standard_output(capsys: pytest.CaptureFixture[str]) -> None:
-    check_result_target("-")
-    write_result("-", {"a": 1})
-    assert json.loads(capsys.readouterr().out) == {"a": 1}
 
 
 @pytest.mark.parametrize("bad", ["", ".", "/", "/dev/null/result.json"])

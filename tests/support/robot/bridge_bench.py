@@ -51,17 +51,17 @@ class Bench:
         self.asked = False
 
     def step(
-        self, *messages: object, shutdown: bool = False, operator: tuple[object, ...] = (), **heard: object
+        self, *messages: object, shutdown: bool = False, operator: tuple[object, ...] = (), **reported: object
     ) -> Outputs:
-        """One step; `heard`: what else came over the robot's network (fields of Report)."""
+        """One step; `reported`: what else came over the robot's network (fields of Report)."""
         if self.mode is not None:
             state = replace(STILL, received_ns=self.now_ns, mode=self.mode, **self.robot)
-            heard = {"state": state, **heard}
-        heard = {"battery_percent": self.battery, **heard}
-        self.battery = heard["battery_percent"]  # type: ignore[assignment]
+            reported = {"state": state, **reported}
+        reported = {"battery_percent": self.battery, **reported}
+        self.battery = reported["battery_percent"]  # type: ignore[assignment]
         if self.asked:
-            heard = {"version": self.version, **heard}
-        inputs = Inputs(messages, self.client, Report(**heard), operator, self.estop, self.asleep_ns, shutdown)
+            reported = {"version": self.version, **reported}
+        inputs = Inputs(messages, self.client, Report(**reported), operator, self.estop, self.asleep_ns, shutdown)
         outputs = self.core.step(inputs, self.now_ns)
         asked = Call(ids.API_VERSION)
         self.asked = asked in outputs.requests
