@@ -19,9 +19,10 @@ from edge.inference import engines
 
 
 @command_line("edge-export")
-def main(argv: Sequence[str]) -> int:
+def main(argv: Sequence[str] | None = None) -> int:
     """Verify an artifact directory without torch; returns the exit code."""
-    parser = argparse.ArgumentParser("edge-export verify", description=__doc__)
+    parser = argparse.ArgumentParser("edge-export", description=__doc__)
+    parser.add_argument("verify", choices=["verify"], help=argparse.SUPPRESS)
     parser.add_argument("directory", type=Path, metavar="DIR", help="artifact directory")
     args = parser.parse_args(argv)
     try:
