@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
+from firmware_bridge.core.version import ARTIFACT_SCHEMA
+
 SCHEMA_VERSION = ARTIFACT_SCHEMA
 MANIFEST_NAME = "manifest.json"
 SIGNATURE_NAME = "manifest.sig"
