@@ -6,7 +6,6 @@ import argparse
 import datetime
 import json
 import math
-import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -19,8 +18,9 @@ from edge.core.cli import (
     EXIT_BAD_INPUT,
     EXIT_CHECK_FAILED,
     EXIT_DONE,
-    EXIT_INTERRUPTED,
     check_result_target,
+    command_line,
+    messages,
     write_named,
     write_result,
 )
@@ -34,7 +34,7 @@ from edge.reasoning.prompt import InstructionError, check_instruction
 from export.evaluation.calibration import CalibrationError, load_calibration
 
 LEAST: Final = 20
-"""Generations that a profile is made of at least: fewer say nothing of the slow ones."""
+"""Generations that a profile is made of at least: fewer show too little of the slow ones."""
 INSTRUCTION: Final = "walk down the corridor and stop at the vending machine"
 
 EXAMPLES: Final = """examples:
@@ -43,7 +43,7 @@ EXAMPLES: Final = """examples:
   edge-calib latency --log orin.latency.json --scale-to-mean 2 --out 2s.latency.json
   edge-bench --suite dynanav --policy artifacts:out/nano --latency profile:orin.latency.json
   edge-train imitate --out out/train --delay-profile orin.latency.json
-Leave the device alone meanwhile, in the power mode that it will drive in.
+Leave the device alone meanwhile, in the power mode that it will drive in. A measurement that fails writes nothing.
 """
 
 
@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--mode", choices=[Mode.ASYNC.value, Mode.NO_REASONING.value], default=Mode.ASYNC.value, help="(default: async)"
     )
-    parser.add_argument("--instruction", default=INSTRUCTION, metavar="TEXT", help="what is thought about")
+    parser.add_argument("--instruction", default=INSTRUCTION, metavar="TEXT", help="instruction of the prompts")
     parser.add_argument(
         "--calibration", default="corridor-go2", metavar="NAME", help="pictures it sees (default: corridor-go2)"
     )
@@ -69,36 +69,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
 
 
+_print = messages("edge-calib latency")
+_BAD_INPUT = (ArtifactError, GraphError, LatencyError, CalibrationError, InstructionError, OSError, ValueError)
+
+
+@command_line("edge-calib latency", {MeasureError: EXIT_CHECK_FAILED, **dict.fromkeys(_BAD_INPUT, EXIT_BAD_INPUT)})
 def run(args: argparse.Namespace) -> int:
     """Measure or read, write; returns the exit code."""
-    try:
-        _check(args)
-        profile, measured = _measured(args) if args.artifacts is not None else (load_profile(args.log), None)
-        if args.scale_to_mean is not None:
-            profile = profile.scaled_to_mean(args.scale_to_mean)
-        if len(profile.generation_s) < LEAST:
-            return _fail(
-                EXIT_CHECK_FAILED,
-                f"{len(profile.generation_s)} generations, expected {LEAST} or more; nothing was written: "
-                "give it more --seconds",
-            )
-        write_named(args.out, json.dumps(profile.as_json(), indent=1) + "\n")
-        result = summary(profile, args.out, measured)
-        write_result(args.json, result)
-    except MeasureError as error:
-        return _fail(EXIT_CHECK_FAILED, f"{error}; nothing was written")
-    except (ArtifactError, GraphError, LatencyError, CalibrationError, InstructionError, OSError, ValueError) as error:
-        return _fail(EXIT_BAD_INPUT, str(error))
-    except KeyboardInterrupt:
-        return _fail(EXIT_INTERRUPTED, "interrupted; nothing was written")
+    _check(args)
+    profile, measured = _measured(args) if args.artifacts is not None else (load_profile(args.log), None)
+    if args.scale_to_mean is not None:
+        profile = profile.scaled_to_mean(args.scale_to_mean)
+    if len(profile.generation_s) < LEAST:
+        raise MeasureError(f"{len(profile.generation_s)} generations, expected {LEAST} or more: give it more --seconds")
+    write_named(args.out, json.dumps(profile.as_json(), indent=1) + "\n")
+    result = summary(profile, args.out, measured)
+    write_result(args.json, result)
     generation = result["generation_s"]
-    _say(
+    _print(
         f"{result['generations']} generations, mean {result['mean_s']:.3f} s, p50 {generation['p50']:.3f} s, "
         f"p99 {generation['p99']:.3f} s, max {generation['max']:.3f} s ({profile.tagged})"
     )
     if measured is not None:
-        _say(f"control beside it: {measured.ticks} ticks, {measured.late} of them late")
-    _say(f"wrote {args.out}: edge-bench --latency profile:{args.out}, edge-train --delay-profile {args.out}")
+        _print(f"control beside it: {measured.ticks} ticks, {measured.late} of them late")
+    _print(f"wrote {args.out}: edge-bench --latency profile:{args.out}, edge-train --delay-profile {args.out}")
     return EXIT_DONE
 
 
@@ -129,7 +123,7 @@ def _measured(args: argparse.Namespace) -> tuple[LatencyProfile, Measured]:
         mode=Mode(args.mode),
         generations=args.generations,
         seconds=args.seconds,
-        say=_say,
+        say=_print,
         stop=stop,
     )
     machine = args.machine or read_device(artifacts.graphs["vision_encoder"].session.provider).device
@@ -159,12 +153,3 @@ def summary(profile: LatencyProfile, out: Path, measured: Measured | None) -> di
         "failed": 0 if measured is None else measured.failed,
         "tagged": profile.tagged,
     }
-
-
-def _say(line: str) -> None:
-    sys.stderr.write(f"edge-calib latency: {line}\n")
-
-
-def _fail(code: int, line: str) -> int:
-    _say(line)
-    return code

@@ -1,4 +1,4 @@
-"""`edge-calib odometry`: fits a robot's odometry to what its gyro and camera, or a measured truth, say of a drive.
+"""`edge-calib odometry`: fits a robot's odometry to what its gyro and camera, or a measured truth, show of a drive.
 
 The drive is cut into intervals: between two answers of the camera, or by time where there is a truth. For each, the
 robot's own motion is compared with the reference. Scales and bias come from least squares with the calibration of an
@@ -19,13 +19,14 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import tomli_w
 
 from edge.core.cli import (
     EXIT_BAD_INPUT,
     EXIT_CHECK_FAILED,
     EXIT_DONE,
-    EXIT_INTERRUPTED,
     check_result_target,
+    command_line,
     write_named,
     write_result,
 )
@@ -36,7 +37,7 @@ from edge.odometry.camera_geometry import Attitude, CameraGeometry
 from edge.odometry.drift_rate import Comparison, DriftMonitor
 from edge.odometry.gate import Increment, OdometryGate, OdometryInputs
 from edge.odometry.pose_chain import Interval, OdometryModel, integrate, split
-from edge.odometry.visual_odometry import VisualMotion, VisualOdometry, grey_frame
+from edge.odometry.visual_odometry import VisualOdometry, grey_frame
 from firmware_bridge.core.config import ConfigError, load_robot_config
 
 Array = npt.NDArray[np.float64]
@@ -60,12 +61,12 @@ class LogError(ValueError):
 
 
 class NoFitError(ValueError):
-    """The fit led to a calibration that no robot has; one line."""
+    """The fit is not good enough, or led to a calibration that no robot has; one line."""
 
 
 @dataclass(frozen=True)
 class Drive:
-    """What a log says: reports in the order of their stamps, and pictures (stamp, JPEG)."""
+    """A log's content: reports in the order of their stamps, and pictures (stamp, JPEG)."""
 
     reports: tuple[OdometryInputs, ...]
     pictures: tuple[tuple[int, bytes], ...]
@@ -166,15 +167,11 @@ def gyro_bias(drive: Drive, prior: OdometryCalibration) -> tuple[float, float]:
         and abs(report.gyro_wz_radps) < STILL_RADPS
         and (report.commanded is None or not any(report.commanded))
     ]
-    seconds = len(rates) * _period_s(drive)
+    span_ns = drive.reports[-1].received_ns - drive.reports[0].received_ns
+    seconds = len(rates) * span_ns / 1e9 / max(1, len(drive.reports) - 1)
     if seconds < 0.5:
         return prior.gyro_bias_radps, prior.gyro_bias_sigma_radps
     return float(np.mean(rates)), GYRO_NOISE_RADPS_RTHZ / math.sqrt(seconds)
-
-
-def _period_s(drive: Drive) -> float:
-    span_ns = drive.reports[-1].received_ns - drive.reports[0].received_ns
-    return span_ns / 1e9 / max(1, len(drive.reports) - 1)
 
 
 def visual_references(drive: Drive, geometry: CameraGeometry) -> list[Reference]:
@@ -189,13 +186,10 @@ def visual_references(drive: Drive, geometry: CameraGeometry) -> list[Reference]
         report = drive.reports[min(bisect_right(stamps, stamp_ns), len(stamps) - 1)]
         motion = eye.step(grey, stamp_ns, Attitude(report.roll_rad, report.pitch_rad))
         if motion is not None:
-            found.append(_reference(motion))
+            c = motion.covariance
+            variance_m2 = 0.5 * (c[0] + c[4])
+            found.append(Reference(motion.start_ns, motion.end_ns, motion.T_start_end, variance_m2, c[8]))
     return found
-
-
-def _reference(motion: VisualMotion) -> Reference:
-    c = motion.covariance
-    return Reference(motion.start_ns, motion.end_ns, motion.T_start_end, 0.5 * (c[0] + c[4]), c[8])
 
 
 def truth_references(path: Path, begin_ns: int, end_ns: int) -> list[Reference]:
@@ -331,46 +325,45 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
 
 
+def calibration_text(calibration: OdometryCalibration, source: str) -> str:
+    """Return a calibration file with six digits a value; `source` is one line of text for its first comment."""
+    values = {name: float(f"{value:.6g}") for name, value in asdict(calibration).items()}
+    return f"# Odometry of one robot, by {source}.\n{tomli_w.dumps(values)}"
+
+
+@command_line(
+    "edge-calib odometry",
+    {
+        NoFitError: EXIT_CHECK_FAILED,
+        **dict.fromkeys((LogError, RecordingError, ConfigError, OSError), EXIT_BAD_INPUT),
+    },
+)
 def run(args: argparse.Namespace) -> int:
     """Fit and write; returns the exit code."""
-    try:
-        check_result_target(args.json)
-        if args.out is not None:
-            check_result_target(str(args.out), "--out")
-        drive = read_drive(args.log)
-        prior = OdometryCalibration()
-        fitted = fit(drive, _references(args, drive), prior)
-        if fitted.good and args.out is not None:
-            comment = (
-                f"Odometry of one robot, by edge-calib odometry from {args.log.name}: {fitted.distance_m:.1f} m driven."
-            )
-            write_named(args.out, fitted.calibration.to_toml(comment))
-        write_result(args.json, {"good": fitted.good, **asdict(fitted)})
-    except NoFitError as error:
-        sys.stderr.write(f"edge-calib odometry: {error}\n")
-        return EXIT_CHECK_FAILED
-    except (LogError, RecordingError, ConfigError, OSError) as error:
-        sys.stderr.write(f"edge-calib odometry: {error}\n")
-        return EXIT_BAD_INPUT
-    except KeyboardInterrupt:
-        sys.stderr.write("edge-calib odometry: interrupted\n")
-        return EXIT_INTERRUPTED
+    check_result_target(args.json)
+    if args.out is not None:
+        check_result_target(str(args.out), "--out")
+    drive = read_drive(args.log)
+    fitted = fit(drive, _references(args, drive), OdometryCalibration())
+    if fitted.good and args.out is not None:
+        source = f"edge-calib odometry from {args.log.name}: {fitted.distance_m:.1f} m driven"
+        write_named(args.out, calibration_text(fitted.calibration, source))
+    write_result(args.json, {"good": fitted.good, **asdict(fitted)})
     sys.stderr.write(_table(fitted))
-    if fitted.good:
-        return EXIT_DONE
-    sys.stderr.write(
-        f"edge-calib odometry: the fit is not good enough to be used: {fitted.intervals} intervals over "
-        f"{fitted.distance_m:.1f} m, {100 * fitted.unexplained:.0f} % of the motion unexplained; expected at least "
-        f"{MIN_INTERVALS} over {MIN_DISTANCE_M:g} m and at most {100 * MAX_UNEXPLAINED:.0f} %: drive on, in light\n"
-    )
-    return EXIT_CHECK_FAILED
+    if not fitted.good:
+        raise NoFitError(
+            f"the fit is not good enough to be used: {fitted.intervals} intervals over {fitted.distance_m:.1f} m, "
+            f"{100 * fitted.unexplained:.0f} % of the motion unexplained; expected at least {MIN_INTERVALS} over "
+            f"{MIN_DISTANCE_M:g} m and at most {100 * MAX_UNEXPLAINED:.0f} %: drive on, in light"
+        )
+    return EXIT_DONE
 
 
 def _references(args: argparse.Namespace, drive: Drive) -> list[Reference]:
     if args.truth is not None:
         return truth_references(args.truth, drive.reports[0].received_ns, drive.reports[-1].received_ns)
     if args.robot is None:
-        raise LogError("expected --robot FILE.toml, whose [mount] says how the camera looks at the floor, or --truth")
+        raise LogError("expected --robot FILE.toml, whose [mount] describes how the camera sees the floor, or --truth")
     mount = load_robot_config(args.robot).mount
     if mount is None:
         raise LogError(f"{args.robot}: has no [mount]: add how the camera is mounted, or give --truth")

@@ -15,7 +15,9 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-from calib.power_fit import STAGES, Fit, FitError, Phase, fit_energy
+import tomli_w
+
+from calib.power_fit import Fit, FitError, Phase, fit_energy
 from calib.power_load import Counts, EnergyLog, Load, run_phases
 from edge.artifacts.files import ArtifactError, read_manifest
 from edge.artifacts.manifest import Artifacts, load_artifacts
@@ -23,24 +25,23 @@ from edge.core.cli import (
     EXIT_BAD_INPUT,
     EXIT_CHECK_FAILED,
     EXIT_DONE,
-    EXIT_INTERRUPTED,
     EXIT_REFUSED,
     check_result_target,
+    command_line,
+    messages,
     write_named,
     write_result,
 )
 from edge.core.device import read_device
 from edge.core.sysfs import SYSFS
 from edge.inference.graph import GraphError
-from edge.power.governor.plan import PowerModel, PowerPlan, read_power_plan
-from edge.power.meters.meter import MEASURED, MODELLED, MeterError, PowerMeter
-from edge.power.meters.modelled import ModelledMeter
+from edge.power.governor.plan import STAGES, PowerModel, PowerPlan, read_power_plan
+from edge.power.meters.meter import MEASURED, MODELLED, MeterError, ModelledMeter, PowerMeter
 from edge.power.meters.select import open_meter
 from export.core.typed import plain
-from export.plan.measure import measured_point
-from export.target.file import Target, TargetError, parse_target
-from export.target.sections import Figure, Measured
-from reporting.toml_text import toml_text
+from export.plan.timing import measured_point
+from export.targets.file import Target, parse_target
+from export.targets.sections import Figure, Measured, TargetError
 
 METERS: Final = ("target", "auto", "ina3221", "nvml", "rapl", "modelled")
 
@@ -65,35 +66,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", metavar="FILE|-", help="write the fit and every phase")
 
 
+_print = messages("edge-calib power")
+_BAD_INPUT = (ArtifactError, GraphError, TargetError, KeyError, OSError, ValueError)
+
+
+@command_line(
+    "edge-calib power",
+    {MeterError: EXIT_REFUSED, FitError: EXIT_CHECK_FAILED, **dict.fromkeys(_BAD_INPUT, EXIT_BAD_INPUT)},
+)
 def run(args: argparse.Namespace, sysfs_root: Path = SYSFS) -> int:
     """Measure, fit, write; returns the exit code."""
-    try:
-        check_result_target(args.json)
-        _check(args)
-        artifacts = load_artifacts(args.artifacts)
-        power = read_power_plan(artifacts)
-        manifest = read_manifest(args.artifacts)
-        target = parse_target(manifest["provenance"]["target"], f"{args.artifacts}: the target in its manifest")
-        counts = Counts()
-        meter = _meter(args.meter, power, counts, sysfs_root)
-        result, written = _calibrate(args, artifacts, manifest, target, meter, counts)
-        write_result(args.json, result)
-    except MeterError as error:
-        return _fail(EXIT_REFUSED, f"{error}; nothing was measured")
-    except FitError as error:
-        return _fail(EXIT_CHECK_FAILED, str(error))
-    except (ArtifactError, GraphError, TargetError, KeyError, OSError, ValueError) as error:
-        return _fail(EXIT_BAD_INPUT, str(error))
-    except KeyboardInterrupt:
-        return _fail(EXIT_INTERRUPTED, "interrupted")
+    check_result_target(args.json)
+    _check(args)
+    artifacts = load_artifacts(args.artifacts)
+    power = read_power_plan(artifacts)
+    manifest = read_manifest(args.artifacts)
+    target = parse_target(manifest["provenance"]["target"], f"{args.artifacts}: the target in its manifest")
+    counts = Counts()
+    meter = _meter(args.meter, power, counts, sysfs_root)
+    result, written = _calibrate(args, artifacts, manifest, target, meter, counts)
+    write_result(args.json, result)
     for line in result["weak"]:
-        _say(line)
+        _print(line)
     if result["weak"]:
-        return _fail(EXIT_CHECK_FAILED, "nothing was written: run it again with longer --seconds on an idle device")
+        raise FitError("nothing was written: run it again with longer --seconds on an idle device")
     if written:
-        _say(f"wrote {args.out}: edge-export --target {args.out} plans with it")
+        _print(f"wrote {args.out}: edge-export --target {args.out} plans with it")
     elif result["tagged"] == MODELLED:
-        _say("modelled: a dry run on the plan's own figures, no target was written")
+        _print("modelled: a dry run on the plan's own figures, no target was written")
     return EXIT_DONE
 
 
@@ -129,9 +129,9 @@ def _calibrate(
     counts: Counts,
 ) -> tuple[dict[str, Any], bool]:
     """(result, whether a target was written)."""
-    _say(f"meter: {meter.source}{f' ({meter.caveat})' if meter.caveat else ''}")
+    _print(f"meter: {meter.source}{f' ({meter.caveat})' if meter.caveat else ''}")
     load = Load(artifacts, counts)
-    phases = run_phases(load, counts, EnergyLog(meter), seconds=args.seconds, rounds=args.rounds, say=_say)
+    phases = run_phases(load, counts, EnergyLog(meter), seconds=args.seconds, rounds=args.rounds, say=_print)
     fit = fit_energy(phases)
     modelled = isinstance(meter, ModelledMeter)
     machine = args.machine or read_device(artifacts.graphs["vision_encoder"].session.provider).device
@@ -209,24 +209,15 @@ def target_text(target: Target) -> str:
     """The target as a file that the exporter reads back as the same target; raises TargetError if it would not."""
     content = target.to_dict()
     content["measured"] = [{k: v for k, v in plain(point).items() if v != {}} for point in target.measured]
-    text = "# Written by edge-calib power. Figures tagged measured are this device's.\n" + toml_text(content)
+    text = "# Written by edge-calib power. Figures tagged measured are this device's.\n" + tomli_w.dumps(content)
     if parse_target(tomllib.loads(text), target.name) != target:
         raise TargetError(f"{target.name}: cannot be written as a file that reads back as the same target")
     return text
 
 
 def _report(fit: Fit) -> None:
-    _say(f"idle {fit.idle_w:.2f} ± {fit.idle_error_w:.2f} W")
+    _print(f"idle {fit.idle_w:.2f} ± {fit.idle_error_w:.2f} W")
     for stage in STAGES:
         unit = {"prefill": "prompt", "decode": "token"}.get(stage, "call")
-        _say(f"{stage} {fit.stage_j[stage]:.4g} ± {fit.error_j[stage]:.2g} J a {unit}")
-    _say(f"explains {100 * fit.r2:.1f} % of the variation, misses unfitted mixtures by {100 * fit.check_error:.1f} %")
-
-
-def _say(line: str) -> None:
-    sys.stderr.write(f"edge-calib power: {line}\n")
-
-
-def _fail(code: int, line: str) -> int:
-    _say(line)
-    return code
+        _print(f"{stage} {fit.stage_j[stage]:.4g} ± {fit.error_j[stage]:.2g} J a {unit}")
+    _print(f"explains {100 * fit.r2:.1f} % of the variation, misses unfitted mixtures by {100 * fit.check_error:.1f} %")

@@ -9,11 +9,11 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-STAGES: Final = ("vision_encoder", "action_expert", "prefill", "decode", "semantic_context")
-"""What is counted: calls, calls, whole prompts, new tokens, calls."""
+from edge.power.governor.plan import STAGES
+
 MIN_R2: Final = 0.9
 MAX_CHECK_ERROR: Final = 0.15
-"""Thresholds of ours: below, the fit says too little of what a run will draw."""
+"""Thresholds of ours: below, the fit predicts too little of what a run will draw."""
 _SWEEPS: Final = 20_000
 
 
@@ -59,7 +59,7 @@ class Fit:
     """Largest relative error of the power of a phase that was left out."""
 
     def power_w(self, phase: Phase) -> float:
-        """What the fit says that a phase draws."""
+        """Power of a phase by the fit, W."""
         return self.idle_w + sum(self.stage_j[name] * n for name, n in phase.counts.items()) / phase.seconds
 
     @property

@@ -12,11 +12,12 @@ from typing import Final
 
 import numpy as np
 
-from calib.power_fit import STAGES, Phase
+from calib.power_fit import Phase
 from edge.artifacts.manifest import Artifacts
 from edge.core.geometry import SE2
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
+from edge.power.governor.plan import STAGES
 from edge.power.meters.meter import MeterError, PowerMeter, PowerSample
 from edge.reasoning.prompt import EXAMPLE_BEFORE, EXAMPLE_WAY
 from edge.state.ring import EncodedFrame
@@ -49,7 +50,7 @@ class Counts:
 
 
 class EnergyLog:
-    """Reads a meter all the time and says the energy between two instants."""
+    """Reads a meter all the time and integrates its power between two instants."""
 
     def __init__(self, meter: PowerMeter, clock: Callable[[], int] = time.monotonic_ns) -> None:
         self._meter = meter

@@ -28,20 +28,18 @@ from edge.core.cli import (
     write_result,
 )
 from export.core.cache import StageCache, default_cache_dir, open_cache
-from export.core.settings import model_settings, target_settings
 from export.evaluation.calibration import CalibrationError, load_calibration
 from export.evaluation.gates import GateError
-from export.model.config import PRESETS, ModelConfigError, TicVlaConfig
-from export.model.config_file import config_for, with_overrides
+from export.model.config import PRESETS, ModelConfigError, TicVlaConfig, config_for, model_settings, with_overrides
 from export.model.weights import WeightsError, save_weights
 from export.pipeline.artifacts import build_artifacts, check_replaceable, verify_directory
 from export.pipeline.build import build_stages
-from export.pipeline.job import Asked, Job, WeightSource
-from export.pipeline.verify import job_of
+from export.pipeline.job import Asked, Job, WeightSource, job_of
 from export.plan.plan import PlanError, plan
 from export.plan.table import plan_lines, plan_table
-from export.target.file import Target, TargetError, list_targets, load_target, with_settings
-from reporting.build_progress import Progress, peak_rss_bytes
+from export.targets.file import Target, list_targets, load_target, with_settings
+from export.targets.sections import TargetError
+from reporting.progress import BuildProgress, peak_rss_bytes
 
 COMMAND = "edge-export"
 DEFAULT_TARGET, DEFAULT_MODEL = "cpu", "nano"
@@ -124,9 +122,7 @@ def _say(line: str) -> None:
 
 def _target_and_config(args: argparse.Namespace) -> tuple[Target, TicVlaConfig]:
     config = with_overrides(config_for(args.model or DEFAULT_MODEL), model_settings(args.settings))
-    return with_settings(
-        load_target(args.target or DEFAULT_TARGET, config.name), target_settings(args.settings)
-    ), config
+    return with_settings(load_target(args.target or DEFAULT_TARGET, config.name), args.settings), config
 
 
 def _asked(args: argparse.Namespace) -> Asked:
@@ -135,8 +131,8 @@ def _asked(args: argparse.Namespace) -> Asked:
     return Asked(shipped, model if model in PRESETS else None, tuple(args.settings))
 
 
-def _check_plan(target: Target, config: TicVlaConfig, args: argparse.Namespace) -> dict[str, Any] | None:
-    """Refuse at once what cannot fit; with --dry-run, the result."""
+def _check_plan(target: Target, config: TicVlaConfig, args: argparse.Namespace) -> None:
+    """Refuse at once what cannot fit; with --dry-run, print the plan."""
     try:
         made = plan(target, config)
     except PlanError as error:
@@ -150,7 +146,6 @@ def _check_plan(target: Target, config: TicVlaConfig, args: argparse.Namespace) 
         write_result(args.json, {"target": target.name, "model": config.name, "plan": made.to_dict()})
     if target.runtime.enforce_plan:
         made.require()
-    return made.to_dict() if args.dry_run else None
 
 
 def _export(args: argparse.Namespace) -> dict[str, Any] | None:
@@ -158,25 +153,32 @@ def _export(args: argparse.Namespace) -> dict[str, Any] | None:
         raise UsageError("--out is missing: expected a directory to write, e.g. --out out/nano")
     check_result_target(args.json)
     target, config = _target_and_config(args)
-    if _check_plan(target, config, args) is not None:
+    _check_plan(target, config, args)
+    if args.dry_run:
         return None
     out = Path(os.path.realpath(args.out))
     if not out.name:
         raise UsageError(f"--out {out}: expected a directory that can be made")
     for option, path in (("--save-weights", args.save_weights), ("--json", args.json)):
-        if path is not None and str(path) != "-":
-            _check_file_target(option, Path(path), out)
+        if path is None or str(path) == "-":
+            continue
+        real = Path(os.path.realpath(path))
+        if real == out or out in real.parents:
+            raise UsageError(
+                f"{option} {path}: lies inside --out, which is replaced as a whole; name a place outside it"
+            )
+        check_result_target(str(path), option)
     check_replaceable(out)
     weights = WeightSource(config, args.checkpoint, args.random_weights)
     job = Job(target, weights, load_calibration(args.calibration or DEFAULT_CALIBRATION), _asked(args))
     with _cache(args, out.parent) as cache:
         run = f"{target.name} {config.name}"
-        progress = Progress(COMMAND, build_stages(job, cache.timings(run)))
+        progress = BuildProgress(COMMAND, build_stages(job, cache.timings(run)))
         try:
             with progress:
                 report = build_artifacts(job, out, cache, progress)
                 if args.save_weights is not None:
-                    loaded = job.weights.get()
+                    loaded = job.weights.loaded
                     with named_file(args.save_weights) as path:
                         save_weights(loaded.model, path, loaded.info)
         finally:
@@ -184,14 +186,6 @@ def _export(args: argparse.Namespace) -> dict[str, Any] | None:
     if not report["model"]["trained"]:
         _say("weights are untrained: the robot will move, it will not navigate")
     return {**_result(report), "out": str(args.out), "stage_s": progress.built_s}
-
-
-def _check_file_target(option: str, path: Path, out: Path) -> None:
-    """Refuse, before a long build, a file that cannot be written or that the new directory would swallow."""
-    real = Path(os.path.realpath(path))
-    if real == out or out in real.parents:
-        raise UsageError(f"{option} {path}: lies inside --out, which is replaced as a whole; name a place outside it")
-    check_result_target(str(path), option)
 
 
 def _verify(args: argparse.Namespace) -> dict[str, Any]:
@@ -209,7 +203,7 @@ def _verify(args: argparse.Namespace) -> dict[str, Any]:
         _say(note)
     with _cache(args, None) as cache:
         run = f"verify {job.target.name} {job.config.name}"
-        progress = Progress(COMMAND, build_stages(job, cache.timings(run), graphs=False))
+        progress = BuildProgress(COMMAND, build_stages(job, cache.timings(run), graphs=False))
         with progress:
             report = verify_directory(job, args.directory, cache, progress)
         cache.remember_timings(run, progress.built_s)

@@ -20,21 +20,24 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from firmware_bridge.client_link import USER_ONLY, ClientLink, SocketGroups, SocketTakenError
 from firmware_bridge.core.config import OPERATOR_SUFFIX, SERVICE_SOCKET, ConfigError, RobotConfig, load_robot_config
 from firmware_bridge.core.link import BridgeStatus
+from firmware_bridge.core.robot_state import DdsError
 from firmware_bridge.core.rules import BridgeCore
 from firmware_bridge.core.step_types import Call, Inputs, Move, Outputs
+from firmware_bridge.core.version import version_line
 from firmware_bridge.latch_file import LatchFile, read_latch
 from firmware_bridge.line_log import LineLog
 from firmware_bridge.notify import Notifier
 from firmware_bridge.output_file import check_output, write_descriptor, write_output
-from firmware_bridge.unitree.dds import DdsError
 from firmware_bridge.unitree.late_interface import AbsentRobot, is_interface_up
 from firmware_bridge.unitree.messages import ids
-from firmware_bridge.unitree.robot_link import RobotLink
+
+if TYPE_CHECKING:
+    from firmware_bridge.unitree.robot_link import RobotLink
 
 _OPERATORS: Final = 4  # at a time
 _LOG_TIMEOUT_S: Final = 0.5
@@ -73,10 +76,14 @@ class Bridge:
         latch_path: Path,
         groups: SocketGroups = USER_ONLY,
     ) -> None:
-        """`latch_path`: file that keeps an emergency stop over restarts; `groups`: who may use the sockets."""
+        """`latch_path`: file that keeps an emergency stop over restarts; `groups`: users that may use the sockets."""
         self._log = log
         self._notifier = notifier
         self._config = config
+        # Only a process that serves needs the DDS binding; a missing one is found here, before the bridge is ready.
+        from firmware_bridge.unitree.robot_link import RobotLink
+
+        self._open_link = RobotLink
         self._robot: RobotLink | AbsentRobot = AbsentRobot(config.dds.interface)
         self._join_robot()
         self._link = ClientLink(config.bridge.socket, group=groups.runner)
@@ -88,11 +95,11 @@ class Bridge:
                 f"--latch {latch_path}: expected a file in an existing folder; create {latch_path.parent}"
             )
         latch = read_latch(latch_path)
-        self._latch_file = LatchFile(latch_path, log.say)
+        self._latch_file = LatchFile(latch_path, log.write)
         self._core = BridgeCore(config.bridge, config.limits, config.safety, time.monotonic_ns(), latch=latch)
         self._period_ns = 1_000_000_000 // config.bridge.rate_hz
         self._wake_ns = self._pinged_ns = time.monotonic_ns()
-        self._said, self._ready, self._extended_ns = "", False, -_EXTEND_NS
+        self._reported, self._ready, self._extended_ns = "", False, -_EXTEND_NS
 
     @property
     def greeting(self) -> str:
@@ -147,13 +154,13 @@ class Bridge:
         """Join the robot's network as soon as its interface is up; whether that has happened in this call."""
         if not isinstance(self._robot, AbsentRobot) or not is_interface_up(self._robot.interface):
             return False
-        self._robot = RobotLink(self._config, self._log.say)
+        self._robot = self._open_link(self._config, self._log.write)
         settle_memory()
         return True
 
     def _step(self, *, shutdown: bool = False) -> Outputs:
         if self._join_robot():
-            self._log.say(self.greeting)
+            self._log.write(self.greeting)
         asleep_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns()
         messages, operator = self._link.receive(), self._operators.receive()
         robot = self._robot.read(time.monotonic_ns())
@@ -168,9 +175,9 @@ class Bridge:
             outputs = replace(outputs, status=replace(outputs.status, reason=reason))
         if isinstance(self._robot, AbsentRobot):
             outputs = replace(outputs, status=replace(outputs.status, reason=self._robot.reason))
-        self._link.tell(outputs.status)
+        self._link.send_status(outputs.status)
         if latch_is_kept:  # a stop that an operator has seen confirmed must survive a kill
-            self._operators.tell(outputs.status)
+            self._operators.send_status(outputs.status)
         self._report_progress(outputs.status)
         return outputs
 
@@ -182,13 +189,13 @@ class Bridge:
             self._extended_ns = now_ns
 
     def _report_progress(self, status: BridgeStatus) -> None:
-        said = f"{status.state}: {status.reason}"
+        line = f"{status.state}: {status.reason}"
         if not self._ready:
-            self._report_start(said, status.stamp_ns)
-        if said != self._said:
-            self._said = said
-            self._log.say(said)
-            self._notifier.status(said)
+            self._report_start(line, status.stamp_ns)
+        if line != self._reported:
+            self._reported = line
+            self._log.write(line)
+            self._notifier.status(line)
         period_ns, late_ns = self._notifier.watchdog_period_ns, status.stamp_ns - self._wake_ns
         if period_ns is not None and status.stamp_ns - self._pinged_ns >= period_ns and late_ns < _LATE_NS:
             self._pinged_ns = status.stamp_ns
@@ -196,7 +203,7 @@ class Bridge:
 
 
 def is_pressed(path: Path) -> bool:
-    """Whether the emergency stop behind a GPIO value file is pressed: unless the file can be read and says 0."""
+    """Whether the emergency stop behind a GPIO value file is pressed: unless the file can be read and holds 0."""
     try:
         file = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
         try:
@@ -208,7 +215,7 @@ def is_pressed(path: Path) -> bool:
 
 
 def settle_memory() -> None:
-    """Let the garbage collector pass over everything that exists now: later collections look at a step's objects."""
+    """Let the garbage collector pass over everything that exists now: later collections visit a step's objects only."""
     gc.collect()
     gc.freeze()
 
@@ -243,10 +250,10 @@ def serve(config: RobotConfig, latch_path: Path, groups: SocketGroups) -> dict[s
         log = LineLog(sys.stderr, "edge-bridge")
         notifier = Notifier(os.environ)
         bridge = Bridge(config, log, notifier, latch_path, groups)
-        log.say(bridge.greeting)
+        log.write(bridge.greeting)
         settle_memory()
         if (unlocked := lock_memory()) is not None:
-            log.say(unlocked)
+            log.write(unlocked)
         try:
             bridge.run(wakeup)
         finally:
@@ -274,6 +281,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--runner-group", metavar="NAME", help="serve: group that may command (default: none)")
     parser.add_argument("--operator-group", metavar="NAME", help="serve: group that may stop and arm (default: none)")
     parser.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
+    parser.add_argument("--version", action="version", version=version_line("edge-bridge"))
     args = parser.parse_args(argv)
     try:
         if args.json not in (None, "-"):
@@ -294,6 +302,11 @@ def main(argv: list[str] | None = None) -> int:
     except (SocketTakenError, ConfigError, DdsError) as error:
         sys.stderr.write(f"edge-bridge: {error}\n")
         return 3 if isinstance(error, SocketTakenError) else 2
+    except ModuleNotFoundError as error:
+        sys.stderr.write(
+            f"edge-bridge: {error.name} is missing: pip install 'tic-vla-edge[unitree]' (arm64: edge-install dds)\n"
+        )
+        return 2
     text = json.dumps(result, indent=2) + "\n"
     try:
         if args.json == "-":

@@ -138,10 +138,10 @@ class ClientLink:
         self._path = path
         self._places = places
         self._listener = listen(path, group)
-        self._deaf = False
+        self._refusing = False
         self._clients: list[socket.socket] = []
-        self._told_ns = 0
-        self._told: tuple[str, ...] = ()
+        self._sent_ns = 0
+        self._sent: tuple[str, ...] = ()
 
     @property
     def connected(self) -> bool:
@@ -149,8 +149,8 @@ class ClientLink:
         return bool(self._clients)
 
     def files(self) -> list[socket.socket]:
-        """What to poll."""
-        return self._clients if self._deaf else [self._listener, *self._clients]
+        """Sockets to poll for input."""
+        return self._clients if self._refusing else [self._listener, *self._clients]
 
     def receive(self) -> list[Message]:
         """Datagrams that have arrived; notices connections and disconnections. Malformed ones are counted, ignored."""
@@ -166,11 +166,11 @@ class ClientLink:
             self._accept()
         return messages
 
-    def tell(self, status: BridgeStatus) -> None:
-        """Send the status when it says something new, and at 10 Hz; dropped when the client does not read."""
+    def send_status(self, status: BridgeStatus) -> None:
+        """Send the status when it has changed, and at 10 Hz; dropped when the client does not read."""
         news = (status.state, status.cause, status.blocked_by)
-        if news != self._told or status.stamp_ns - self._told_ns >= _STATUS_PERIOD_NS:
-            self._told_ns, self._told = status.stamp_ns, news
+        if news != self._sent or status.stamp_ns - self._sent_ns >= _STATUS_PERIOD_NS:
+            self._sent_ns, self._sent = status.stamp_ns, news
             for client in self._clients:
                 with contextlib.suppress(OSError):  # a closed connection is noticed by receive()
                     client.send(encode(status))
@@ -182,20 +182,20 @@ class ClientLink:
         self._path.unlink(missing_ok=True)
 
     def _accept(self) -> None:
-        self._deaf = False
+        self._refusing = False
         try:
             fresh, _ = self._listener.accept()
         except BlockingIOError:
             return
         except OSError:  # no descriptor left, or the client has gone again: not to be polled before the next step
-            self._deaf = True
+            self._refusing = True
             return
         if len(self._clients) >= self._places > 1:
             self._drop(self._clients[0])
         if len(self._clients) < self._places:
             fresh.setblocking(False)
             self._clients.append(fresh)
-            self._told = ()
+            self._sent = ()
         else:
             fresh.close()  # without a greeting: its BridgeClient knows what that means
 

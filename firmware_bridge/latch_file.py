@@ -20,7 +20,7 @@ from typing import Final
 _MAX_BYTES: Final = 400
 _WRITE_FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NONBLOCK | os.O_CLOEXEC
 _PATIENCE_NS: Final = 200_000_000
-"""A disk that takes longer does not keep an operator from hearing of a stop."""
+"""A disk that takes longer does not delay the confirmation of a stop."""
 _EARLIER: Final = "emergency stop of an earlier bridge"
 
 
@@ -50,10 +50,10 @@ def _check_regular(path: Path) -> None:
 class LatchFile:
     """Keeps one file equal to the latch; `keep` never waits."""
 
-    def __init__(self, path: Path, say: Callable[[str], None]) -> None:
-        """`say` takes one line for the operator when the file cannot be written."""
+    def __init__(self, path: Path, report: Callable[[str], None]) -> None:
+        """`report` takes one line for the operator when the file cannot be written."""
         self._path = path
-        self._say = say
+        self._report = report
         self._kept = read_latch(path)
         self._change = self._done = 0  # numbers of the newest change and of the newest one that was carried out
         self._changed_ns = 0
@@ -64,10 +64,10 @@ class LatchFile:
         self._thread.start()
 
     def keep(self, reason: str, now_ns: int) -> bool:
-        """Make the file say `reason`, or remove it when that is empty.
+        """Make the file hold `reason`, or remove it when that is empty.
 
         Returns whether a kill now would leave the file as it should be, or it has failed or takes too long. An
-        operator hears of a stop only then.
+        operator gets a stop confirmed only then.
         """
         if reason != self._kept:
             self._kept, self._changed_ns, self._change = reason, now_ns, self._change + 1
@@ -90,8 +90,8 @@ class LatchFile:
             except OSError as error:
                 self.failed, self._done = True, number  # as well as it goes
                 failed = ("cannot be written", "may not survive") if reason else ("cannot be removed", "will survive")
-                says = f"{failed[0]} ({error.strerror}): an emergency stop {failed[1]} a restart of the bridge"
-                self._say(f"latch file {self._path}: {says}")
+                text = f"{failed[0]} ({error.strerror}): an emergency stop {failed[1]} a restart of the bridge"
+                self._report(f"latch file {self._path}: {text}")
 
     def _write(self, reason: str) -> None:
         with contextlib.suppress(FileNotFoundError):

@@ -9,17 +9,17 @@ from typing import TextIO
 
 
 class LineLog:
-    """Bounded queue in front of a text stream; `say` never waits, what does not fit is dropped and counted."""
+    """Bounded queue in front of a text stream; `write` never waits; a line that does not fit is dropped and counted."""
 
     def __init__(self, stream: TextIO, prefix: str, *, capacity: int = 64) -> None:
         self.dropped = 0
         self._stream = stream
         self._prefix = prefix
         self._lines: queue.Queue[str | None] = queue.Queue(capacity)
-        self._thread = threading.Thread(target=self._write, name="line-log", daemon=True)
+        self._thread = threading.Thread(target=self._drain, name="line-log", daemon=True)
         self._thread.start()
 
-    def say(self, line: str) -> None:
+    def write(self, line: str) -> None:
         """Queue one line."""
         try:
             self._lines.put_nowait(line)
@@ -32,8 +32,8 @@ class LineLog:
             self._lines.put_nowait(None)
         self._thread.join(timeout_s)
 
-    def _write(self) -> None:
+    def _drain(self) -> None:
         for line in iter(self._lines.get, None):
-            with contextlib.suppress(OSError, ValueError):  # closed or full: there is nobody left to tell
+            with contextlib.suppress(OSError, ValueError):  # closed or full: nobody reads any more
                 self._stream.write(f"{self._prefix}: {line}\n")
                 self._stream.flush()

@@ -16,7 +16,7 @@ MAX_STATUS_CHARS: Final = 200
 class Notifier:
     """The service manager's socket, as the environment that it gave this process names it; never blocks, never raises.
 
-    Every method returns whether its message has been sent: a `ready` that was not has to be said again.
+    Every method returns whether its message has been sent: a `ready` that was not has to be sent again.
     """
 
     def __init__(self, environment: Mapping[str, str]) -> None:
@@ -58,7 +58,7 @@ class Notifier:
         return self._send(f"EXTEND_TIMEOUT_USEC={max(0, round(seconds * 1e6))}")
 
     def close(self) -> None:
-        """Say nothing any more."""
+        """Send nothing any more."""
         self._address = None
         if self._socket is not None:
             self._socket.close()
@@ -83,7 +83,7 @@ def _address(name: str) -> str | None:
 
 
 def _watchdog_us(environment: Mapping[str, str]) -> int | None:
-    """WATCHDOG_USEC if it is meant for this process and says something."""
+    """WATCHDOG_USEC if it is meant for this process and is a time."""
     text, pid = environment.get("WATCHDOG_USEC", ""), environment.get("WATCHDOG_PID", "")
     if pid and pid != str(os.getpid()):
         return None

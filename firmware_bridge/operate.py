@@ -38,15 +38,15 @@ Answer = BridgeStatus | BridgeUnavailable | Unconfirmed
 
 
 def operate(command: str, *sockets: Path) -> tuple[int, dict[str, object]]:
-    """Do `command` at every bridge that listens at one of `sockets`, say on stderr what they are doing then.
+    """Do `command` at every bridge that listens at one of `sockets`, report their states on stderr.
 
     Returns the exit code (0 done, 1 not confirmed by all in time, 3 refused or no bridge) and a status as JSON values.
-    `arm` is done at one bridge only: where several answer, the operator has to say which.
+    `arm` is done at one bridge only: where several answer, the operator has to choose one.
     """
     answers = _at_each("status" if command == "arm" else command, *sockets)
     reached = [socket for socket, answer in answers.items() if not isinstance(answer, BridgeUnavailable)]
     if command == "arm" and len(reached) > 1:
-        return _refuse(f"bridges answer at {' and '.join(map(str, reached))}; say which with --socket")
+        return _refuse(f"bridges answer at {' and '.join(map(str, reached))}; choose one with --socket")
     if command == "arm":
         answers |= _at_each(command, *reached)
     missing = [answer for answer in answers.values() if isinstance(answer, BridgeUnavailable)]
@@ -78,7 +78,7 @@ def _why_unconfirmed(command: str, status: BridgeStatus | None) -> str:
     if command == "stop" and status.motion == "moving":
         return f"STOPPED, BUT THE ROBOT STILL MOVES at {status.speed_mps:.2f} m/s: {_USE_REMOTE}"
     if command == "stop":
-        return f"the bridge has stopped, but the robot does not report whether it stands still: look, or {_USE_REMOTE}"
+        return f"the bridge has stopped, but the robot does not report that it stands still: check it, or {_USE_REMOTE}"
     return f"{command} was not confirmed within {CONFIRM_S:g} s"
 
 
@@ -153,7 +153,7 @@ def _follow(
 ) -> BridgeStatus | Unconfirmed:
     """The first status made after `since_ns` for which `done` is true, within `limit_s` of `since_ns` or of now.
 
-    `again` is called before every look: a repeated stop changes nothing, a lost one would.
+    `again` is called before every poll: a repeated stop changes nothing, a lost one would.
     """
     deadline_ns = (since_ns or time.monotonic_ns()) + round(limit_s * 1e9)
     status = None

@@ -1,4 +1,4 @@
-"""The look that all reports share: colours, figures, axes, and the histogram of the delay. No global state."""
+"""Style of all plots: colours, figures, axes and histograms, drawn with matplotlib's object interface."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ DPI = 160
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """An empty figure drawn with matplotlib's object interface."""
+    """Return an empty figure."""
     figure = Figure(figsize=(width_in, height_in), dpi=DPI, facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
 def png(figure: Figure) -> bytes:
-    """The figure as PNG."""
+    """Return the figure as PNG; its bytes depend only on the figure."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
+    figure.savefig(buffer, format="png", metadata={"Software": None})
     return buffer.getvalue()
 
 
 def tidy(axes: Axes) -> None:
-    """Light grid behind, no box."""
+    """Draw a light grid behind the data and no box."""
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     axes.spines["left"].set_color(MUTED)
@@ -49,27 +49,33 @@ def tidy(axes: Axes) -> None:
 
 
 def legend_above(axes: Axes) -> None:
-    """The legend in a row above the axes."""
+    """Draw the legend in a row above the axes."""
     axes.legend(fontsize=8, frameon=False, loc="lower right", bbox_to_anchor=(1, 0.98), ncols=4, borderaxespad=0)
 
 
 def percentile(samples: Array, percent: float) -> float:
-    """Nearest rank, a value that occurred: the same as the runner's `edge.core.stats.percentiles`."""
+    """Return the nearest-rank percentile, as `edge.core.stats.percentiles` does."""
     return float(np.percentile(samples, percent, method="inverted_cdf"))
 
 
+def draw_histogram(axes: Axes, samples: Array, bin_width: float, colour: str, unit: str, digits: int) -> None:
+    """Draw a histogram from 0 with lines at p50, p99 and the maximum."""
+    largest = float(samples.max())
+    axes.hist(samples, bins=np.arange(0, largest + bin_width, bin_width).tolist(), color=colour)
+    lines = (("p50", percentile(samples, 50), ":", INK), ("p99", percentile(samples, 99), "--", INK))
+    for name, value, dash, line_colour in (*lines, ("max", largest, "-", MUTED)):
+        label = f"{name} {value:.{digits}f} {unit}"
+        axes.axvline(value, color=line_colour, linewidth=1, linestyle=dash, label=label)
+    legend_above(axes)
+
+
 def delay_histogram(delays_s: Array) -> bytes:
-    """Age Δt of the semantic state over all ticks that had one."""
+    """Draw the age Δt of the semantic state over all ticks that had one, s."""
     figure = new_figure(5.4, 3.1)
     axes = figure.add_subplot()
     if len(delays_s):
-        p50, p99 = percentile(delays_s, 50), percentile(delays_s, 99)
         # Ticks are 0.1 s apart, so a finer bin would show the comb of the ticks instead of the delay.
-        axes.hist(delays_s, bins=np.arange(0, delays_s.max() + 0.1, 0.1).tolist(), color=PERSON)
-        axes.axvline(p50, color=INK, linewidth=1, linestyle=":", label=f"p50 {p50:.2f} s")
-        axes.axvline(p99, color=INK, linewidth=1, linestyle="--", label=f"p99 {p99:.2f} s")
-        axes.axvline(delays_s.max(), color=MUTED, linewidth=1, label=f"max {delays_s.max():.2f} s")
-        legend_above(axes)
+        draw_histogram(axes, delays_s, 0.1, PERSON, "s", 2)
     axes.set_xlim(left=0)
     axes.set_xlabel("Δt = now − capture of the anchor frame, in s", fontsize=9)
     axes.set_ylabel("ticks", fontsize=9)

@@ -69,7 +69,7 @@ def record(walk: Walk, duration_s: float = CLIP_S) -> Iterator[Frame]:
         for tick in range(ticks + 1):
             if tick >= first and (tick - first) % every == 0:
                 yield _frame(simulation, world, (tick - first) * 100_000_000)
-            simulation.move(*_command(simulation, walk, tick * CONTROL_S))
+            simulation.command(*_command(simulation, walk, tick * CONTROL_S))
             _steps(simulation, CONTROL_S)
         if simulation.fell or simulation.collided_with():
             raise WalkError(f"walk {walk.name}: fell or touched {sorted(simulation.collided_with())}")
@@ -141,7 +141,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog="example:\n  python -m tools.calibration_frames --out export/calibration_sets",
+        epilog="example:\n  python -m tools.calibration_frames --out export/evaluation/calibration_sets",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write corridor-go2/ into")
     args = parser.parse_args(argv)

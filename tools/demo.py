@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import shutil
 import signal
 import sys
@@ -17,13 +18,22 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from edge.artifacts.files import MANIFEST_NAME
-from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, command_line, write_result
-from export.checkpoint.coverage import CheckpointError
-from export.checkpoint.shipped import shipped_weights
+from edge.core.cli import (
+    EXIT_BAD_INPUT,
+    EXIT_CHECK_FAILED,
+    EXIT_DONE,
+    EXIT_INTERRUPTED,
+    command_line,
+    messages,
+    write_result,
+)
+from export.checkpoint.load import shipped_weights
 from export.model.config import PRESETS
-from reporting.progress_line import Progress, TraceTail
+from export.model.weights import CheckpointError
+from reporting.progress import Progress
 from sim_hil.realtime.children import Child, Children, StepError
 from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_FILE, free_domain, slow_robot, socket_dir
+from sim_hil.realtime.truth import LineTail
 from tools.report.demo_report import RunFiles, write_report
 from tools.report.machine import machine_facts
 from tools.report.run_data import Record, ReportError
@@ -41,7 +51,9 @@ EXPORT_TIMEOUT_S = 1800.0
 READY_TIMEOUT_S = 90.0
 BRIDGE_TIMEOUT_S = 30.0
 STARTUP_TIMEOUT_S = 120.0
-LAST_COMMANDS_S = 0.5  # between the bridge's end and the robot's, so that its last words are in the trace
+LAST_COMMANDS_S = 0.5  # between the bridge's end and the robot's, so that its last commands are in the trace
+
+_print = messages("demo")
 
 EXAMPLES = """examples:
   python -m tools.demo --out out/demo
@@ -96,9 +108,26 @@ class DemoOptions:
         return RunFiles(self.out, self.artifacts)
 
 
-def _say(line: str) -> None:
-    sys.stderr.write(f"demo: {line}\n")
-    sys.stderr.flush()
+class TraceTail(LineTail):
+    """Follows edge-hil's trace while it is written: Move requests received and metres walked so far."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self._last: tuple[float, float] | None = None
+        self._last_ns = 0
+        self.moves = 0
+        self.walked_m = 0.0
+
+    def update(self) -> None:
+        """Count what was added since the last call."""
+        for line in self.lines():
+            if line["kind"] == "wire" and line["name"] == "Move":
+                self.moves += 1
+            elif line["kind"] == "pose" and line["t_ns"] - self._last_ns >= 1_000_000_000:
+                # One-second steps, so that a body swaying in place does not add up to a walk.
+                position = (line["x"], line["y"])
+                self.walked_m += 0.0 if self._last is None else math.dist(position, self._last)
+                self._last, self._last_ns = position, line["t_ns"]
 
 
 def run_demo(
@@ -119,7 +148,7 @@ def run_demo(
     with socket_dir() as socket_folder, Children(options.log_dir) as children:
         _export(options, commands["edge-export"], children)
         _drive(options, commands, children, socket_folder / "bridge.sock")
-    _say("writing the report")
+    _print("writing the report")
     return report(options.files, wall_s=(time.monotonic_ns() - started_ns) / 1e9)
 
 
@@ -132,10 +161,10 @@ def _export(options: DemoOptions, command: Sequence[str], children: Children) ->
         else:
             child = children.start("edge-export-verify", [*command, "verify", artifacts])
             if _run_to_end(children, child, f"checking the artifacts in {artifacts}") == 0:
-                _say(f"artifacts in {artifacts} verified, not exported again")
+                _print(f"artifacts in {artifacts} verified, not exported again")
                 return
             why = f"do not verify (see {child.log})"
-        _say(f"artifacts in {artifacts} {why}, exporting again")
+        _print(f"artifacts in {artifacts} {why}, exporting again")
         if ours:
             shutil.rmtree(options.artifacts)  # edge-export itself decides about any other directory
     result = str(options.files.result("edge-export"))
@@ -154,8 +183,14 @@ def trained(artifacts: Path) -> bool:
         return False
 
 
+def _progress(describe: Callable[[float], str]) -> Progress:
+    """Show `describe(elapsed_s)` while a step runs."""
+    started_ns = time.monotonic_ns()
+    return Progress("demo: ", lambda: describe((time.monotonic_ns() - started_ns) / 1e9))
+
+
 def _run_to_end(children: Children, child: Child, what: str) -> int:
-    with Progress(lambda elapsed_s: f"demo: {what}, {elapsed_s:.0f} s") as progress:
+    with _progress(lambda elapsed_s: f"{what}, {elapsed_s:.0f} s") as progress:
         code = children.wait(child, EXPORT_TIMEOUT_S, progress.tick)
     children.forget(child)
     return code
@@ -167,11 +202,11 @@ def _drive(options: DemoOptions, commands: Mapping[str, Sequence[str]], children
     robot = ROBOT_FILE if trained(options.artifacts) else slow_robot(options.out, UNTRAINED_SPEED_MPS)
     common = ["--robot", str(robot), "--socket", str(socket), *domain]
     hil = children.start("edge-hil", [*commands["edge-hil"], *_hil_arguments(options), *domain])
-    with Progress(lambda elapsed_s: f"demo: starting the simulated robot, {elapsed_s:.0f} s") as progress:
+    with _progress(lambda elapsed_s: f"starting the simulated robot, {elapsed_s:.0f} s") as progress:
         children.wait_until(hil, lambda: _says_ready(hil.log), READY_TIMEOUT_S, "ready line", progress.tick)
     bridge_result = ["--json", str(files.result("edge-bridge"))]
     bridge = children.start("edge-bridge", [*commands["edge-bridge"], *common, *bridge_result])
-    with Progress(lambda elapsed_s: f"demo: starting the bridge, {elapsed_s:.0f} s") as progress:
+    with _progress(lambda elapsed_s: f"starting the bridge, {elapsed_s:.0f} s") as progress:
         children.wait_until(bridge, socket.exists, BRIDGE_TIMEOUT_S, f"socket {socket}", progress.tick)
     run = children.start("edge-run", [*commands["edge-run"], *common, *_run_arguments(options)])
     trace = TraceTail(files.trace)
@@ -179,15 +214,15 @@ def _drive(options: DemoOptions, commands: Mapping[str, Sequence[str]], children
     def describe(elapsed_s: float) -> str:
         trace.update()
         return (
-            f"demo: driving {elapsed_s:.0f} s of {options.duration_s:.0f} s and start-up · "
+            f"driving {elapsed_s:.0f} s of {options.duration_s:.0f} s and start-up · "
             f"{trace.moves} commands · {trace.walked_m:.1f} m walked"
         )
 
-    with Progress(describe) as progress:
+    with _progress(describe) as progress:
         code = children.wait(run, options.duration_s + STARTUP_TIMEOUT_S, progress.tick)
     if code == EXIT_CHECK_FAILED and files.result("edge-run").exists():
         # A fault ended the run early. Its report is the way to find out why, and fails by its checks.
-        _say(str(run.failure("a fault ended the run")))
+        _print(str(run.failure("a fault ended the run")))
     elif code != 0:
         raise run.failure(f"exit code {code}")
     children.forget(run)
@@ -255,7 +290,7 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]
         options = DemoOptions(args.out, artifacts, args.duration, args.seed, args.people, domain)
         _make_folder(options.log_dir)
     except (ValueError, OSError) as error:
-        _say(str(error))
+        _print(str(error))
         return EXIT_BAD_INPUT
     # SIGINT too: a shell starts background jobs with it ignored, and the children would inherit that.
     before = {number: signal.signal(number, _interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -263,17 +298,17 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]
         summary = run_demo(options, commands)
         write_result(args.json, summary)
     except KeyboardInterrupt:
-        _say("interrupted, all processes ended")
+        _print("interrupted, all processes ended")
         return EXIT_INTERRUPTED
     except (StepError, ReportError, CheckpointError, OSError) as error:
-        _say(str(error))
+        _print(str(error))
         return EXIT_CHECK_FAILED
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
     failed = [name for name, check in summary["checks"].items() if not check["pass"]]
     for name in failed:
-        _say(f"check {name} failed: {json.dumps(summary['checks'][name])}")
+        _print(f"check {name} failed: {json.dumps(summary['checks'][name])}")
     (sys.stderr if args.json == "-" else sys.stdout).write(f"{options.files.report}\n")
     return EXIT_CHECK_FAILED if failed else EXIT_DONE
 

@@ -1,4 +1,4 @@
-"""Write the fault table as a page: what can go wrong, what the robot does, how soon, and the test that injects it.
+"""Write the fault table as a page: what can go wrong, what the robot does, and how soon.
 
 python -m tools.fault_table > docs/faults.md
 """
@@ -15,11 +15,11 @@ Made from `edge/safety/faults/table.py` by `python -m tools.fault_table`; do not
 *Row* is the row of the project's fault
 matrix. *Bound* runs from the fault's effect at our input to the velocity on the wire. The bound of `camera-frozen`
 holds for pictures that are equal byte for byte. A scene that stays the same under noise, a clock or a new JPEG
-encoding is found by distance, after about 0.25 m or 12° of motion. What is done:
+encoding is found by distance, after about 0.25 m or 12° of motion. The actions:
 
 * **nothing**: control must not change; the fault is dropped or counted.
 * **limit**: the speed limit is lowered to the share that is given, the arc is kept; `semantic-old` lowers it with age;
-  without a share the operator is told and nothing else.
+  without a share the operator reads the message and nothing else changes.
 * **zero**: zero velocity until the fault has been gone for its clear time.
 * **stop**: zero velocity until the robot is armed again.
 
@@ -36,12 +36,12 @@ No emergency stops:
 * `edge-say "stop at the door"`, or any longer text: **the robot drives on**. The text is an instruction for the model.
 * The end of the runner (Ctrl-C, SIGTERM, SIGKILL): the bridge stops the robot, but a new run may arm by itself.
 
-| row | fault | where | done | bound | ends | says | next |
+| row | fault | where | action | bound | ends | message | next step |
 |---:|---|---|---|---:|---|---|---|
 """
 
 
-def _done(fault: Fault) -> str:
+def _action(fault: Fault) -> str:
     share = f" to {fault.speed_scale:.0%}" if fault.action is Action.LIMIT and fault.speed_scale < 1 else ""
     return fault.action.value + share
 
@@ -59,8 +59,8 @@ def _ends(fault: Fault) -> str:
 def page() -> str:
     """The whole table as Markdown, ordered by row."""
     lines = [
-        f"| {fault.row} | `{fault.name}` | {fault.where} | {_done(fault)} | "
-        f"{f'{fault.bound_ms} ms' if fault.bound_ms else ''} | {_ends(fault)} | {fault.says} | {fault.advice} |"
+        f"| {fault.row} | `{fault.name}` | {fault.where} | {_action(fault)} | "
+        f"{f'{fault.bound_ms} ms' if fault.bound_ms else ''} | {_ends(fault)} | {fault.message} | {fault.advice} |"
         for fault in sorted(FAULTS.values(), key=lambda fault: (fault.row, fault.bound_ms))
     ]
     left_out = [f"* row {row}: {why}" for row, why in sorted(NOT_HERE.items())]

@@ -14,8 +14,9 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import FrameType
-from typing import Any, ParamSpec, TextIO
+from typing import Any, Final, ParamSpec, TextIO
 
+from firmware_bridge.core.version import version_line
 from firmware_bridge.output_file import (
     check_output,
     open_through,
@@ -119,24 +120,46 @@ def _named(what: object) -> Iterator[None]:
         raise OutputError(f"{what}: cannot be written: {error.strerror or error}") from error
 
 
-def command_line(name: str) -> Callable[[Callable[P, int]], Callable[P, int]]:
+def messages(name: str) -> Callable[[str], None]:
+    """Return a function that writes `name: line` to standard error at once."""
+
+    def write(line: str) -> None:
+        sys.stderr.write(f"{name}: {line}\n")
+        sys.stderr.flush()
+
+    return write
+
+
+def command_line(
+    name: str, exits: Mapping[type[Exception], int] | None = None
+) -> Callable[[Callable[P, int]], Callable[P, int]]:
     """Decorate the main function of a command: an output that cannot be written is one line and EXIT_CHECK_FAILED.
 
-    Standard output is flushed here, where its error can still be reported.
+    `exits`: exit codes of other errors, by their type; the first that fits counts, its text is the one line. Standard
+    output is flushed here, where its error can still be reported. An interrupted command is one line and
+    EXIT_INTERRUPTED.
     """
+    codes, report = dict(exits or {}), messages(name)
 
     def decorate(main: Callable[P, int]) -> Callable[P, int]:
         @functools.wraps(main)
         def run(*args: P.args, **kwargs: P.kwargs) -> int:
             try:
-                code = main(*args, **kwargs)
+                try:
+                    code = main(*args, **kwargs)
+                except tuple(codes) as error:
+                    report(str(error))
+                    code = next(code for kind, code in codes.items() if isinstance(error, kind))
+                except KeyboardInterrupt:
+                    report("interrupted")
+                    code = EXIT_INTERRUPTED
                 with _named("standard output"):
                     sys.stdout.flush()
                 return code
             except (OutputError, OSError) as error:
                 if isinstance(error, OSError) and error.errno not in (errno.ENOSPC, errno.EPIPE):
                     raise
-                sys.stderr.write(f"{name}: {error}\n")
+                report(str(error))
                 _give_up_stdout()
                 return EXIT_CHECK_FAILED
 
@@ -171,14 +194,41 @@ def _give_up_stdout() -> None:
         os.close(null)
 
 
-def run_with_extra(command: str, module: str, extra: str) -> int:
-    """Run `module.main()` of an optional part; without its packages, write one line: how to install them."""
+# Module -> extra of pyproject.toml that installs it.
+_EXTRAS: Final = {
+    "onnxruntime": "cpu", "cyclonedds": "unitree", "pymavlink": "mavlink", "can": "can", "cantools": "can",
+    "torch": "export", "onnx": "export", "onnxscript": "export", "safetensors": "export", "jinja2": "export",
+    "pybullet": "sim", "panda3d": "sim", "direct": "sim", "scipy": "sim", "gymnasium": "sim", "matplotlib": "sim",
+    "cryptography": "sign", "ray": "cluster",
+}  # fmt: skip
+
+
+def missing_extra(error: ModuleNotFoundError, extra: str = "") -> str | None:
+    """Return one line on how to install the missing module; None where no extra has it."""
+    name = (error.name or "").partition(".")[0]
+    needed = extra or _EXTRAS.get(name, "")
+    if name not in _EXTRAS and not extra:
+        return None
+    also = ", or NVIDIA's onnxruntime-gpu on a Jetson" if name == "onnxruntime" else ""
+    also = " (arm64: edge-install dds)" if name == "cyclonedds" else also
+    return f"needs the packages of the extra {needed!r} ({name} is missing): pip install 'tic-vla-edge[{needed}]'{also}"
+
+
+def run_with_extra(command: str, module: str, extra: str = "") -> int:
+    """Run `module.main()`; `--version` needs none of its packages, a missing extra is one line that names it."""
+    report = messages(command)
+    if sys.argv[1:] == ["--version"]:
+        sys.stdout.write(f"{version_line(command)}\n")
+        return EXIT_DONE
     try:
         main = importlib.import_module(module).main
+        return int(main())
     except ModuleNotFoundError as error:
-        sys.stderr.write(
-            f"{command}: needs the packages of the extra {extra!r} ({error.name} is missing): "
-            f"pip install 'tic-vla-edge[{extra}]'\n"
-        )
+        line = missing_extra(error, extra)
+        if line is None:
+            raise
+        report(line)
         return EXIT_BAD_INPUT
-    return int(main())
+    except KeyboardInterrupt:  # while modules load; afterwards the command answers itself
+        report("interrupted")
+        return EXIT_INTERRUPTED

@@ -8,7 +8,6 @@ requests from the runner's reading: what remains is written down in docs/robot_n
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from ipaddress import IPv4Network, collapse_addresses
 from typing import Final
 
@@ -22,39 +21,27 @@ _PORTS_A_DOMAIN: Final = 250
 _MAX_PORT: Final = 65535
 
 
-@dataclass(frozen=True)
-class CableRules:
-    """All that the rules depend on."""
-
-    interface: str
-    """Name of the interface that the robot's cable is plugged into."""
-    networks: tuple[IPv4Network, ...]
-    """Where the robot is: at best its one address."""
-    domain: int
-    """DDS domain."""
-    users: tuple[str, ...]
-    """Users that may send to the robot; root besides."""
-
-    def __post_init__(self) -> None:
-        if self.interface[:1].isdigit():
-            raise UnitError(
-                f"dds.interface: expected an interface's name for the firewall, such as eth0, found {self.interface}"
-            )
-        if not self.networks or not self.users:
-            raise UnitError("the firewall needs the robot's network and the users that may send to it")
-
-
 def ports(domain: int) -> tuple[int, int]:
     """First and last UDP port of a DDS domain (RTPS 2.5, section 9.6.2.3: base 7400, domain gain 250)."""
     first = _PORT_BASE + _PORTS_A_DOMAIN * domain
     return first, min(first + _PORTS_A_DOMAIN - 1, _MAX_PORT)
 
 
-def ruleset(rules: CableRules) -> str:
-    """Text of the nftables file; loading it again replaces the table."""
-    cable, (first, last) = f'"{rules.interface}"', ports(rules.domain)
+def ruleset(interface: str, networks: Sequence[IPv4Network], domain: int, users: Sequence[str]) -> str:
+    """Text of the nftables file; loading it again replaces the table. Raises UnitError.
+
+    `interface`: name of the robot's cable; `networks`: the robot, at best its one address; `domain`: DDS domain;
+    `users`: those that may send to the robot, root besides.
+    """
+    if interface[:1].isdigit():
+        raise UnitError(f"dds.interface: expected a name for the firewall, such as eth0, found {interface}")
+    if not networks or not users:
+        raise UnitError("the firewall needs the robot's network and the users that may send to it")
+    cable, (first, last) = f'"{interface}"', ports(domain)
     dds = f"udp dport {first}-{last}"
-    users = ", ".join([*(f'"{user}"' for user in rules.users), '"root"'])
+    senders = ", ".join([*(f'"{user}"' for user in users), '"root"'])
+    merged = collapse_addresses(networks)  # an interval set must not overlap
+    robot = ", ".join(str(network.network_address if network.prefixlen == 32 else network) for network in merged)
     return f"""\
 # Made by edge-install units: what may pass the robot's cable. Write it anew instead of editing it.
 # Check it with `nft -c -f FILE`; show the counters with `nft list table inet {TABLE}`.
@@ -64,15 +51,15 @@ table inet {TABLE} {{
     set robot {{
         type ipv4_addr
         flags interval
-        elements = {{ {_elements(rules.networks)} }}
+        elements = {{ {robot} }}
     }}
 
     # Only the services' users send, and only to the robot. Root is let through: it could remove this table.
     chain output {{
         type filter hook output priority filter; policy accept;
         oifname != {cable} accept
-        meta skuid {{ {users} }} ip daddr @robot {dds} accept
-        meta skuid {{ {users} }} ip daddr {MULTICAST.network_address} {dds} accept
+        meta skuid {{ {senders} }} ip daddr @robot {dds} accept
+        meta skuid {{ {senders} }} ip daddr {MULTICAST.network_address} {dds} accept
         meta l4proto igmp accept
         ip daddr @robot icmp type {{ echo-request, echo-reply, destination-unreachable }} accept
         counter drop
@@ -97,9 +84,3 @@ table inet {TABLE} {{
     }}
 }}
 """
-
-
-def _elements(networks: Sequence[IPv4Network]) -> str:
-    """Addresses and networks of an interval set, which must not overlap."""
-    merged = collapse_addresses(networks)
-    return ", ".join(str(network.network_address if network.prefixlen == 32 else network) for network in merged)

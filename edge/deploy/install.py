@@ -14,10 +14,10 @@ from edge.artifacts.trust import KeyFileError
 from edge.core.cli import (
     EXIT_BAD_INPUT,
     EXIT_DONE,
-    EXIT_INTERRUPTED,
     EXIT_REFUSED,
     check_result_target,
     command_line,
+    messages,
     write_result,
 )
 from edge.deploy import board, dds_binding, install_units
@@ -36,7 +36,8 @@ EXAMPLES = """examples:
   sudo edge-install board --wheel tic_vla_edge-0.1.0-py3-none-any.whl --artifacts out/cpu --extras cpu,unitree
   sudo edge-install rollback
 
-units wants a robot file with operator_arm = true in [safety], or --arm-at-start.
+units needs a robot file with operator_arm = true in [safety], or --arm-at-start. An interrupted build of engines keeps
+the finished ones: run it again to go on.
 
 exit codes: 0 done, 1 a step failed or systemd finds fault with the units, 2 bad arguments or input,
             3 refused (artifacts, device), 130 interrupted
@@ -66,35 +67,30 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
-def _say(line: str) -> None:
-    sys.stderr.write(f"edge-install: {line}\n")
-    sys.stderr.flush()
+_print = messages("edge-install")
 
 
-@command_line("edge-install")
+@command_line(
+    "edge-install",
+    {
+        ArtifactError: EXIT_REFUSED,
+        engines.EngineError: EXIT_REFUSED,
+        **dict.fromkeys((OSError, ConfigError, InstructionError, KeyFileError, UnitError), EXIT_BAD_INPUT),
+    },
+)
 def main(
     argv: Sequence[str] | None = None, machine: engines.Machine | None = None, host: install_units.Host | None = None
 ) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
     if args.command == "dds":
-        return dds_binding.run(args, _say)
+        return dds_binding.run(args, _print)
     if args.command in board.COMMANDS:
-        return board.run(args, _say)
-    try:
-        check_result_target(args.json)
-        if args.command == "units":
-            return install_units.run(args, _say, host)
-        return _build_engines(args, machine)
-    except (ArtifactError, engines.EngineError) as error:
-        _say(str(error))
-        return EXIT_REFUSED
-    except (OSError, ConfigError, InstructionError, KeyFileError, UnitError) as error:
-        _say(str(error))
-        return EXIT_BAD_INPUT
-    except KeyboardInterrupt:
-        _say("interrupted; what was finished is kept, run it again to go on")
-        return EXIT_INTERRUPTED
+        return board.run(args, _print)
+    check_result_target(args.json)
+    if args.command == "units":
+        return install_units.run(args, _print, host)
+    return _build_engines(args, machine)
 
 
 def _build_engines(args: argparse.Namespace, machine: engines.Machine | None) -> int:
@@ -102,12 +98,12 @@ def _build_engines(args: argparse.Namespace, machine: engines.Machine | None) ->
     directory = args.artifacts.absolute()
     where = args.engines.absolute() if args.engines is not None else engines.default_directory(directory)
     if where == directory or directory in where.parents:
-        _say(f"--engines {args.engines}: lies inside the artifact directory, which is sealed; name another")
+        _print(f"--engines {args.engines}: lies inside the artifact directory, which is sealed; name another")
         return EXIT_BAD_INPUT
     artifacts = load_artifacts(directory)
-    graphs = engines.build(artifacts, where, _say, machine)
+    graphs = engines.build(artifacts, where, _print, machine)
     if not graphs:
-        _say(f"{artifacts.target}: no graph needs an engine")
+        _print(f"{artifacts.target}: no graph needs an engine")
     wall_s = round((time.monotonic_ns() - started_ns) / 1e9, 3)
     write_result(args.json, {"engines": str(where), "graphs": graphs, "wall_s": wall_s})
     return EXIT_DONE

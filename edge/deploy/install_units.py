@@ -24,9 +24,16 @@ from edge.artifacts.trust import STATE_DIRECTORY, Trust
 from edge.core.cli import EXIT_CHECK_FAILED, EXIT_DONE, write_result, write_whole
 from edge.deploy import units
 from edge.deploy.releases import LINK
-from edge.deploy.service_users import BRIDGE_USER, OPERATOR_GROUP, RUNNER_USER, SYSUSERS_FILE, ServiceUsers, sysusers
 from edge.deploy.unit_check import MAX_EXPOSURE, UnitVerdict, check_units, systemd_version
-from edge.deploy.unit_text import UnitError
+from edge.deploy.unit_text import (
+    BRIDGE_USER,
+    OPERATOR_GROUP,
+    RUNNER_USER,
+    SYSUSERS_FILE,
+    ServiceUsers,
+    UnitError,
+    sysusers,
+)
 from edge.inference import engines
 from edge.run.instructions import check_first_instruction
 from firmware_bridge.core.config import DdsConfig, load_robot_config
@@ -75,10 +82,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--artifacts", type=Path, required=True, metavar="DIR", help="directory made by edge-export")
     parser.add_argument("--robot", type=Path, required=True, metavar="FILE.toml", help="the robot and its limits")
     text = parser.add_mutually_exclusive_group(required=True)
-    text.add_argument("--instruction", metavar="TEXT", help="what the robot is to do, in plain words")
+    text.add_argument("--instruction", metavar="TEXT", help="what the robot is to do, in a sentence")
     text.add_argument("--instruction-file", type=Path, metavar="FILE", help="the same, read from a file now")
     place = parser.add_mutually_exclusive_group(required=True)
-    place.add_argument("--out", type=Path, metavar="DIR", help="write the files here, to be looked at or copied")
+    place.add_argument("--out", type=Path, metavar="DIR", help="write the files here, to be read or copied")
     place.add_argument("--system", action="store_true", help="write them to where systemd reads them (needs root)")
     parser.add_argument(
         "--home", type=Path, metavar="DIR",
@@ -133,11 +140,11 @@ def run(args: argparse.Namespace, say: Callable[[str], None], host: Host | None 
     elif inputs.engines is not None:
         say(f"{inputs.engines}: not there yet; build it before the runner starts: edge-install engines")
     if inputs.operator_arm and args.arm_at_start:
-        say(f"{inputs.robot}: says operator_arm, so --arm-at-start changes nothing: the bridge waits for an operator")
+        say(f"{inputs.robot}: has operator_arm, so --arm-at-start changes nothing: the bridge waits for an operator")
     closed = unreadable(needed)
     for path in closed:
         say(f"{path}: the services cannot read it unless it is theirs: chmod o+rX {shlex.quote(str(path))}")
-    _say_firewall(inputs, say)
+    _report_firewall(inputs, say)
     contents = _contents(args, inputs, host)
     written = _write(contents, force=args.force)
     for path in contents:
@@ -174,7 +181,7 @@ def of_release(host: Host, home: Path) -> Host:
 
 
 def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
-    """Everything that the units say, from the arguments, the artifacts, the robot file and the machine."""
+    """Everything that the units depend on, from the arguments, the artifacts, the robot file and the machine."""
     robot = load_robot_config(args.robot, socket=units.SOCKET)
     if not robot.safety.operator_arm and not args.arm_at_start:
         raise UnitError(
@@ -314,7 +321,7 @@ def _contents(args: argparse.Namespace, inputs: units.ServiceInputs, host: Host)
     return contents
 
 
-def _say_firewall(inputs: units.ServiceInputs, say: Callable[[str], None]) -> None:
+def _report_firewall(inputs: units.ServiceInputs, say: Callable[[str], None]) -> None:
     if inputs.over_loopback:
         return
     if inputs.nft is None:
@@ -365,8 +372,8 @@ def _commands(contents: Mapping[Path, str], inputs: units.ServiceInputs, *, syst
     )
     prepare += ["sudo systemd-sysusers", f'sudo usermod -aG {inputs.users.operators} "$USER"']
     firewall = [path.name for path in contents if path.name == units.FIREWALL_UNIT]
-    # Not enabled if it arms by itself: a machine that starts again after a brown-out must not drive before somebody has
-    # looked at it.
+    # Not enabled if it arms by itself: a machine that starts again after a brown-out must not drive before a person
+    # has seen it.
     drive = [f"sudo systemctl start {units.RUNNER_UNIT}"]
     if inputs.operator_arm:
         drive = [f"sudo systemctl enable --now {units.RUNNER_UNIT}", _bridge_command("arm", inputs)]
@@ -379,9 +386,9 @@ def _commands(contents: Mapping[Path, str], inputs: units.ServiceInputs, *, syst
     ]
 
 
-def _bridge_command(word: str, inputs: units.ServiceInputs) -> str:
+def _bridge_command(command: str, inputs: units.ServiceInputs) -> str:
     bridge, robot = shlex.quote(str(inputs.programs / "edge-bridge")), shlex.quote(str(inputs.robot))
-    return f"sudo {bridge} {word} --robot {robot} --socket {units.SOCKET}"
+    return f"sudo {bridge} {command} --robot {robot} --socket {units.SOCKET}"
 
 
 def _home_of(path: Path) -> str:

@@ -1,4 +1,4 @@
-"""What systemd itself says of unit files: `systemd-analyze verify` and `security --offline`; nothing is started."""
+"""systemd's own verdict on unit files: `systemd-analyze verify` and `security --offline`; nothing is started."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class UnitVerdict:
     exposure: dict[str, float]
     """Score of each service."""
     not_checked: tuple[str, ...]
-    """What could not be had, in words."""
+    """What could not be checked, for the operator."""
 
     @property
     def good(self) -> bool:
@@ -49,7 +49,7 @@ def run_command(command: Sequence[str]) -> tuple[int, str]:
 
 
 def systemd_version(run: Runner = run_command, which: Callable[[str], str | None] = shutil.which) -> int | None:
-    """Version of this machine's systemd; None where there is none or it does not say."""
+    """Version of this machine's systemd; None where there is none or it does not report one."""
     tool = which("systemd-analyze")
     if tool is None:
         return None
@@ -83,13 +83,13 @@ def _check(tool: str, paths: Sequence[Path], run: Runner) -> UnitVerdict:
         if found is not None:
             exposure[path.name] = float(found[2])
         else:
-            said = next((line.strip() for line in text.splitlines() if line.strip()), "nothing")
-            not_checked.append(f"{path.name}: its exposure was not scored ({said}); systemd 250 and later score files")
+            reason = next((line.strip() for line in text.splitlines() if line.strip()), "nothing")
+            not_checked.append(f"{path.name}: no score of its exposure ({reason}); systemd 250 and later score files")
     return UnitVerdict(tuple(complaints), tuple(others), exposure, tuple(not_checked))
 
 
 def _verify(tool: str, paths: Sequence[Path], run: Runner) -> tuple[list[str], list[str]]:
-    """Lines about these units, and about others. An unknown key is a line and status 0: the status says too little."""
+    """Lines about these units, and about others. An unknown key is a line, with status 0."""
     status, text = run([tool, "verify", "--man=no", *(str(path) for path in paths)])
     ours = {path.name for path in paths}
     complaints: list[str] = []

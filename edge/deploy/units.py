@@ -17,8 +17,7 @@ from typing import Final
 from edge.artifacts.trust import STATE_DIRECTORY
 from edge.core.device import CUDA, OPENVINO, TENSORRT
 from edge.deploy import firewall
-from edge.deploy.service_users import ServiceUsers
-from edge.deploy.unit_text import Setting, UnitError, argument, bound, render, word
+from edge.deploy.unit_text import ServiceUsers, Setting, UnitError, argument, bound, render, word
 from firmware_bridge.core.config import BRIDGE_PRIORITY
 
 BRIDGE_UNIT: Final = "tic-vla-edge-bridge.service"
@@ -35,7 +34,7 @@ RESTART_STEPS_SINCE: Final = 254
 """First version of systemd with RestartSteps= (its NEWS file)."""
 BRIDGE_MEMORY: Final = "256M"
 RUNNER_MEMORY_SHARE: Final = "75%"
-"""Of the machine's memory, where the target does not say: the rest is left to everything else; a choice of ours."""
+"""Of the machine's memory, where the target gives none: the rest is left to everything else; a choice of ours."""
 WIDEST_PREFIX: Final = 16
 """Shortest prefix of a network that the address filter lets through, bits: a wider one filters hardly anything."""
 HIDDEN: Final = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
@@ -97,9 +96,8 @@ class ServiceInputs:
             if not getattr(self, name).is_absolute():
                 raise UnitError(f"{name} {getattr(self, name)}: expected an absolute path")
         for program in (self.programs, self.python):
-            if not set(str(program)) & set("'\"\\"):
-                continue
-            raise UnitError(f"{program}: systemd takes no program with quotes or backslashes in its path; move it")
+            if set(str(program)) & set("'\"\\"):
+                raise UnitError(f"{program}: systemd takes no program with quotes or backslashes in its path; move it")
         if not self.networks:
             raise UnitError("no network of the robot is known: give it with --network, e.g. 192.168.123.0/24")
         for network in collapse_addresses(self.networks):
@@ -144,13 +142,13 @@ def bridge_unit(inputs: ServiceInputs) -> str:
         "It gives its sockets to these groups; the runner is not in the second, so it can take back no emergency stop.",
         ("SupplementaryGroups", f"{users.runner} {users.operators}"),
         *_ending(watchdog_s=1, start_s=20, stop_s=2),
-        "Always, also after a clean exit: without it the robot has nobody that can stop it.",
+        "Always, also after a clean exit: without it nothing can stop the robot.",
         ("Restart", "always"),
         *_back_off(inputs.systemd),
         "Before everything else on its core; systemd-wide throttling of real-time tasks still lets the system breathe.",
         ("CPUSchedulingPolicy", "fifo"),
         ("CPUSchedulingPriority", str(BRIDGE_PRIORITY)),
-        *_cores(inputs.bridge_cores),
+        *([("CPUAffinity", " ".join(map(str, inputs.bridge_cores)))] if inputs.bridge_cores else []),
         ("LimitRTPRIO", str(BRIDGE_PRIORITY)),
         "A loop that spins: killed after this much computing without a pause (start-up takes less).",
         ("LimitRTTIME", "5s"),
@@ -237,10 +235,11 @@ def runner_unit(inputs: ServiceInputs) -> str:
         "connection ends with the old bridge. After: at shutdown the runner stops first.",
         ("Wants", BRIDGE_UNIT),
         ("After", BRIDGE_UNIT),
-        *_network(inputs),
+        *([] if inputs.over_loopback else [("Wants", "network-online.target"), ("After", "network-online.target")]),
         *_behind_firewall(inputs),
         # A start that fails slowly must be counted too, so the window holds several of the longest starts.
-        *_restarts(900),
+        ("StartLimitIntervalSec", "900"),
+        ("StartLimitBurst", "5"),
     ]
     return _render("runner", {"Unit": unit, "Service": service, "Install": [("WantedBy", "multi-user.target")]})
 
@@ -248,12 +247,12 @@ def runner_unit(inputs: ServiceInputs) -> str:
 def _starting_again(inputs: ServiceInputs) -> list[Setting | str]:
     if not inputs.operator_arm:
         return [
-            "A runner that arms by itself would drive on after a crash, before anybody has looked at the robot.",
+            "A runner that arms by itself would drive on after a crash, before a person has seen the robot.",
             ("Restart", "no"),
         ]
     return [
         "After a signal, a time-out or the watchdog. An exit with a code is a decision, such as a fault that latched:",
-        "nobody but the operator starts the robot again after it.",
+        "only the operator starts the robot again after it.",
         ("Restart", "on-abnormal"),
         ("RestartSec", "2s"),
     ]
@@ -292,18 +291,12 @@ def firewall_unit(inputs: ServiceInputs) -> str:
 def firewall_rules(inputs: ServiceInputs) -> str:
     """Text of the nftables file; raises UnitError for an interface without a name."""
     users = (inputs.users.bridge, inputs.users.runner)
-    return firewall.ruleset(firewall.CableRules(inputs.interface, inputs.networks, inputs.domain, users))
+    return firewall.ruleset(inputs.interface, inputs.networks, inputs.domain, users)
 
 
 def _render(which: str, sections: dict[str, list[Setting | str]]) -> str:
     comment = [f"Made by edge-install units: the {which} of one robot. Write it anew instead of editing it; see also"]
     return render([*comment, "systemctl edit, which keeps changes of yours apart."], sections)
-
-
-def _network(inputs: ServiceInputs) -> list[Setting | str]:
-    if inputs.over_loopback:
-        return []
-    return [("Wants", "network-online.target"), ("After", "network-online.target")]
 
 
 def _behind_firewall(inputs: ServiceInputs) -> list[Setting | str]:
@@ -320,10 +313,6 @@ def _back_off(systemd: int | None) -> list[Setting | str]:
     return [("RestartSec", "100ms"), ("RestartSteps", "5"), ("RestartMaxDelaySec", "5s")]
 
 
-def _restarts(window_s: int) -> list[Setting | str]:
-    return [("StartLimitIntervalSec", str(window_s)), ("StartLimitBurst", "5")]
-
-
 def _ending(*, watchdog_s: int, start_s: int, stop_s: int) -> list[Setting | str]:
     return [
         ("TimeoutStartSec", str(start_s)),
@@ -335,10 +324,6 @@ def _ending(*, watchdog_s: int, start_s: int, stop_s: int) -> list[Setting | str
         ("KillMode", "mixed"),
         ("TimeoutStopSec", str(stop_s)),
     ]
-
-
-def _cores(cores: Sequence[int]) -> list[Setting | str]:
-    return [("CPUAffinity", " ".join(str(core) for core in cores))] if cores else []
 
 
 def _hardening(inputs: ServiceInputs, needed: Sequence[Path]) -> list[Setting | str]:
@@ -354,7 +339,7 @@ def _hardening(inputs: ServiceInputs, needed: Sequence[Path]) -> list[Setting | 
         ("CapabilityBoundingSet", ""),
         ("ProtectHome", "tmpfs" if hidden else "yes"),
         *((("BindReadOnlyPaths", " ".join(bound(path) for path in hidden)),) if hidden else ()),
-        "A /tmp of its own: Unitree's SDK writes /tmp/cdds.LOG, which anybody else could have put there.",
+        "A /tmp of its own: Unitree's SDK writes /tmp/cdds.LOG, which another user could have put there.",
         *_confinement(),
     ]
 

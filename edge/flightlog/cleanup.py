@@ -2,7 +2,7 @@
 start.
 
 A recording bounds itself, but every start makes another. Whole runs are deleted, the oldest first, until the rest fits;
-the newest runs stay whatever they take, so that what happened last can always be looked at.
+the newest runs stay whatever they take, so that the last events can always be read.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, command_line, messages
 
 KEEP_BYTES: Final = 8 * 1024**3
 """Two recordings at their own bound (edge.flightlog.recorder); a choice of ours."""
@@ -30,7 +30,7 @@ EXAMPLES = """examples:
   python -m edge.flightlog.cleanup /var/lib/tic-vla-edge
   python -m edge.flightlog.cleanup /var/lib/tic-vla-edge --keep-bytes 2000000000
 
-Only files named flight-ID.mcap and flight-ID.NNN.mcap are looked at.
+Only files named flight-ID.mcap and flight-ID.NNN.mcap are considered.
 exit codes: 0 done, 2 bad arguments or a folder that cannot be read or written, 130 interrupted
 """
 
@@ -92,29 +92,27 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
-def _say(line: str) -> None:
-    sys.stderr.write(f"edge.flightlog.cleanup: {line}\n")
-    sys.stderr.flush()
+_print = messages("edge.flightlog.cleanup")
 
 
+@command_line("edge.flightlog.cleanup")
 def main(
     argv: Sequence[str] | None = None, total_bytes: Callable[[Path], int] = lambda path: shutil.disk_usage(path).total
 ) -> int:
     """Entry point; returns the exit code. `total_bytes`: size of the file system that holds a path."""
     args = parser().parse_args(argv)
     if args.keep_bytes < 0:
-        _say(f"--keep-bytes {args.keep_bytes}: expected 0 or more")
+        _print(f"--keep-bytes {args.keep_bytes}: expected 0 or more")
         return EXIT_BAD_INPUT
     try:
         deleted, left = clean(args.folder, min(args.keep_bytes, round(KEEP_SHARE * total_bytes(args.folder))))
     except OSError as error:
-        _say(f"{error.filename or args.folder}: {error.strerror or error}; expected a folder whose logs may be deleted")
+        _print(
+            f"{error.filename or args.folder}: {error.strerror or error}; expected a folder whose logs may be deleted"
+        )
         return EXIT_BAD_INPUT
-    except KeyboardInterrupt:
-        _say("interrupted")
-        return EXIT_INTERRUPTED
     if deleted:
-        _say(f"{len(deleted)} files of old runs deleted, the first {deleted[0].name}; {left / 2**20:.0f} MiB stay")
+        _print(f"{len(deleted)} files of old runs deleted, the first {deleted[0].name}; {left / 2**20:.0f} MiB stay")
     return EXIT_DONE
 
 

@@ -6,7 +6,7 @@ compression, write, fsync — happens in the writer thread. What the queue canno
 
 On disk a recording is bounded too. It is written in parts (`flight.mcap`, `flight.002.mcap`, …), each a whole MCAP that
 begins with the `/run` record; beyond `total_bytes` the oldest part but the first is deleted, so that how the run began
-and how it ended are kept. While the file system has less than `free_bytes` left nothing is written (`error` says so)
+and how it ended are kept. While the file system has less than `free_bytes` left nothing is written (`error` names it)
 and what comes is dropped and counted; a write error ends the recording.
 
 A chunk is closed and handed to the device at least once a second, so a process killed in the middle loses at most the
@@ -31,7 +31,7 @@ from edge.flightlog.reader import part_path, parts
 ARMING_FREE_SHARE = 0.07
 """Fault matrix row 51: a robot that records is not armed with less of its file system free (openpilot's figure)."""
 _FLUSH_PERIOD_NS = 900_000_000  # below one second even when a pass of the loop is late
-_POLL_S = 0.05  # the writer looks by itself, so that a caller never pays for waking it
+_POLL_S = 0.05  # the writer polls, so that a caller never pays for waking it
 _PART_AGE_NS = 300 * 1_000_000_000
 """The index of a part is kept in memory until it is finished, 1 KiB a second: what five minutes take is used again."""
 _NICENESS = 10
@@ -140,7 +140,7 @@ class Recorder:
     def put(self, topic: str, stamp_ns: int, payload: Payload) -> None:
         """Queue one record; never blocks, never raises, encodes nothing.
 
-        `payload` is a mapping that JSON can hold (numpy values allowed) and that nobody changes afterwards, or
+        `payload` is a mapping that JSON can hold (numpy values allowed) and that no thread changes afterwards, or
         the bytes of a JPEG, which become a `foxglove.CompressedImage`.
         """
         size = len(payload) if isinstance(payload, bytes) else 0
@@ -201,7 +201,7 @@ class Recorder:
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
         try:
             self._write_all(self._begin(file))
-        except Exception as error:  # noqa: BLE001 - a thread that ends must always say why in `error`
+        except Exception as error:  # noqa: BLE001 - a thread that ends must always give the reason in `error`
             reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
             self._fail(f"recording to {self.path} stopped: {reason or type(error).__name__}")
         finally:
@@ -218,7 +218,7 @@ class Recorder:
         return self._part
 
     def _write_all(self, part: LogPart) -> None:
-        self._look_at_space()
+        self._check_space()
         begun_ns = flushed_ns = time.monotonic_ns()
         while True:
             # Asked before the queue is emptied: whatever was put before close() is then written.
@@ -235,7 +235,7 @@ class Recorder:
                 if part.file.removed:
                     raise OSError("the file was removed while recording")
                 self._all_saved()
-                self._look_at_space()
+                self._check_space()
                 flushed_ns = now_ns
                 if now_ns - begun_ns >= _PART_AGE_NS:
                     part, begun_ns = self._next_part(part), now_ns
@@ -278,7 +278,7 @@ class Recorder:
         self._number += 1
         return self._begin(PartFile(part_path(self.path, self._number), new=True))
 
-    def _look_at_space(self) -> None:
+    def _check_space(self) -> None:
         """Pause below the floor; go on once there is clearly more."""
         floor = self._limits.free_bytes
         free = _free(self.path)
@@ -308,7 +308,7 @@ def space_refusal(path: Path, limits: RecorderLimits | None = None) -> str | Non
 
 
 def _free(path: Path) -> tuple[int, int] | None:
-    """Bytes free to us, and in all, of the file system that holds `path`; None where nobody knows."""
+    """Bytes free to us, and in all, of the file system that holds `path`; None where it cannot be read."""
     try:
         found = os.statvfs(path.parent)
     except OSError:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from edge.core.geometry import SE2
 from edge.odometry.drift_rate import DriftRate
-from firmware_bridge.unitree.messages.state import BatteryState, RobotState
+from firmware_bridge.core.robot_state import BatteryState, RobotState
 
 
 class Throttle:
@@ -39,7 +39,7 @@ def odometry_record(
     drift: DriftRate | None,
     command: tuple[float, float, float] | None,
 ) -> dict[str, Any]:
-    """`/odometry`: what the robot reported, what was made of it, and the velocity it had been told."""
+    """`/odometry`: what the robot reported, what was made of it, and the last commanded velocity."""
     rad_per_m = None if drift is None else drift.rad_per_m
     return {
         "raw_pose": state.T_odom_base,

@@ -75,7 +75,7 @@ SCHEMAS: Mapping[str, Schema] = {
         generation=_INT_OR_NULL,
         anchor_ns=_INT_OR_NULL,
         delay_s=_NUMBER_OR_NULL,
-        delay_given_s=_NUMBER_OR_NULL,  # what the policy was told: within what it was trained for
+        delay_given_s=_NUMBER_OR_NULL,  # as the policy received it: within its training range
         offset=_VECTOR_OR_NULL,
         offset_sd=_VECTOR_OR_NULL,  # standard deviations of the offset, m, m, rad
         pose=_VECTOR_OR_NULL,
@@ -115,13 +115,13 @@ SCHEMAS: Mapping[str, Schema] = {
         frames_ns={"type": "array", "items": _INT},  # stamps of /camera, oldest first
         frame_poses=_ROWS,  # (x m, y m, θ rad) at those
         way=_ROWS,  # (x m, y m) in the robot frame at the anchor: the prompt's past motion
-        before=_TEXT,  # the progress that the prompt told, "none." without one
-        follow=_TEXT,  # what might be said after it: free, onward, either way
+        before=_TEXT,  # the progress in the prompt, "none." without one
+        follow=_TEXT,  # progress allowed after it: free, onward, either way
         turn=_TEXT_OR_NULL,  # left or right: the turn that was next then
-        turn_left_m=_VECTOR_OR_NULL,  # how far it is by each earlier look
+        turn_left_m=_VECTOR_OR_NULL,  # its distance by each earlier observation
         turn_may_be_done=_BOOL,  # whether the robot can have made it, by odometry
-        overruled=_BOOL,  # whether the model would have said another progress
-        planned=_TEXT,  # the plan's line as the model said it, where it was held to another distance
+        overruled=_BOOL,  # whether the model would have decoded another progress
+        planned=_TEXT,  # the plan's line as the model decoded it, where another distance was required
         stop=_VECTOR_OR_NULL,  # (x m, y m, θ rad) in the odometry's frame: where the answers mean to stop
         prompt_tokens=_INT,
         max_new_tokens=_INT,
@@ -161,7 +161,7 @@ SCHEMAS: Mapping[str, Schema] = {
     "/odometry": _record(
         "tic_vla.Odometry",
         ("roll_rad", "pitch_rad", "foot_forces"),
-        raw_pose=_VECTOR,  # x m, y m, θ rad, as the robot says
+        raw_pose=_VECTOR,  # x m, y m, θ rad, as the robot reports
         velocity=_VECTOR,  # vx m/s, vy m/s, ωz rad/s
         gyro_wz_radps=_NUMBER_OR_NULL,
         roll_rad=_NUMBER_OR_NULL,

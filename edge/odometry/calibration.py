@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 if sys.version_info >= (3, 11):
@@ -48,11 +48,6 @@ class OdometryCalibration:
             _require(0.5 <= getattr(self, name) <= 2, f"{name}: expected 0.5..2, found {getattr(self, name)}")
         for name in ("sideways_m_per_m", "gyro_bias_radps"):
             _require(abs(getattr(self, name)) <= 0.5, f"{name}: expected -0.5..0.5, found {getattr(self, name)}")
-
-    def to_toml(self, comment: str) -> str:
-        """The file's text; every line of `comment` becomes a comment at its head."""
-        lines = [f"# {line}" for line in comment.splitlines()]
-        return "\n".join([*lines, *(f"{name} = {value:.6g}" for name, value in asdict(self).items())]) + "\n"
 
 
 def load_calibration(path: Path) -> OdometryCalibration:

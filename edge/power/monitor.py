@@ -12,13 +12,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Final, Generic, TypeVar
 
-from edge.power.governor.governor import LEVELS as GOVERNOR_LEVELS
-from edge.power.governor.governor import OFF, Governor, GovernorInputs, GovernorOutputs
-from edge.power.governor.statistics import PowerStatistics
-from edge.power.meters.battery import BatteryReading, ReadBattery
-from edge.power.meters.meter import MEASURED, MODELLED, MeterError, PowerMeter, PowerSample
-from edge.power.meters.overcurrent import OverCurrentEvents
-from edge.power.meters.thermal import ThermalReader, ThermalState
+from edge.power.governor.average import PowerStatistics
+from edge.power.governor.governor import LEVELS, OFF, Governor, GovernorInputs, GovernorOutputs
+from edge.power.meters.meter import MEASURED, MODELLED, BatteryReading, MeterError, PowerMeter, PowerSample, ReadBattery
+from edge.power.meters.thermal import OverCurrentEvents, ThermalReader, ThermalState
 from edge.reasoning.generation_cycle import ReasoningBudget
 from edge.safety.faults.findings import Finding
 
@@ -38,10 +35,10 @@ class Activity:
     ticks: int = 0
     reasoning: bool = False
     """A generation is under way."""
-    generations: int | None = None
-    """Finished ones; None: counted from `reasoning`, which misses those shorter than a period."""
-    reasoning_s: float | None = None
-    """Time that generations have taken; None: counted from `reasoning`."""
+    generations: int = 0
+    """Finished ones."""
+    reasoning_s: float = 0.0
+    """Time that generations have taken."""
     abandoned: int = 0
     """Generations that were begun and not finished, whatever the reason."""
 
@@ -84,29 +81,15 @@ class _Source(Generic[T]):
         self._read = read
         self._period_s = period_s
         self._clock = clock
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self.stop = threading.Event()
+        self.thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._newest: tuple[int, T] | None = None
         self.error: str | None = None
-
-    def start(self) -> None:
-        """Begin reading."""
-        self._thread.start()
 
     def fresh(self, now_ns: int, oldest_ns: int) -> T | None:
         """The newest value if it is not too old."""
         newest = self._newest
         return None if newest is None or now_ns - newest[0] > oldest_ns else newest[1]
-
-    def stop(self) -> None:
-        """Ask the thread to end."""
-        self._stop.set()
-
-    def join(self, timeout_s: float) -> bool:
-        """Wait for it; False if it hangs in a reading: it is left behind and ends with the process."""
-        if self._thread.ident is not None:
-            self._thread.join(timeout_s)
-        return not self._thread.is_alive()
 
     def read(self) -> None:
         """Read once in the calling thread; a failure leaves the newest value as it was."""
@@ -120,9 +103,9 @@ class _Source(Generic[T]):
             self.error = f"{type(error).__name__}: {error}"
 
     def _run(self) -> None:
-        while not self._stop.is_set():
+        while not self.stop.is_set():
             self.read()
-            self._stop.wait(self._period_s)
+            self.stop.wait(self._period_s)
 
 
 class PowerMonitor:
@@ -159,9 +142,8 @@ class PowerMonitor:
         self._events = (
             None if over_current is None else _Source("over-current", lambda _: over_current.read(), 1.0, clock)
         )
-        self._felt: ThermalState | None = None
+        self._judged_heat: ThermalState | None = None
         self._heat_lost = False
-        self._counted: tuple[int, bool, int, float] | None = None
         self._statistics = PowerStatistics()
         self._measured = True
         self._failed: str | None = None
@@ -170,19 +152,18 @@ class PowerMonitor:
     def start(self) -> None:
         """Begin; until the first step nothing is limited."""
         for source in self._sources():
-            source.start()
+            source.thread.start()
         self._thread.start()
 
     def close(self) -> None:
-        """End; a reading that hangs is not waited for longer than half a second in all."""
+        """End; a reading that hangs is waited for at most half a second in all, and ends with the process."""
         self._stop.set()
         for source in self._sources():
-            source.stop()
+            source.stop.set()
         deadline_s = time.monotonic() + JOIN_S
-        if self._thread.ident is not None:
-            self._thread.join(JOIN_S)
-        for source in self._sources():
-            source.join(max(0.0, deadline_s - time.monotonic()))
+        for thread in (self._thread, *(source.thread for source in self._sources())):
+            if thread.ident is not None:
+                thread.join(max(0.0, deadline_s - time.monotonic()))
 
     def budget(self) -> ReasoningBudget:
         """What reasoning may do now."""
@@ -195,12 +176,11 @@ class PowerMonitor:
     def statistics(self) -> dict[str, Any]:
         """`power_w` of a result: mean and p99 of the metered samples, in W, and where they come from."""
         mean_w, p99_w = self._statistics.mean_w, self._statistics.percentile_w(0.99)
-        known = self._meter is not None and mean_w is not None
         result: dict[str, Any] = {
             "mean": None if mean_w is None else round(mean_w, 3),
             "p99": None if p99_w is None else round(p99_w, 2),
-            "source": self._meter.source if known and self._meter is not None else "none",
-            "tagged": MEASURED if known and self._measured else MODELLED,
+            "source": "none" if self._meter is None or mean_w is None else self._meter.source,
+            "tagged": MEASURED if mean_w is not None and self._measured else MODELLED,
         }
         if self._snapshot.over_current:
             result["over_current_events"] = dict(self._snapshot.over_current)
@@ -215,23 +195,22 @@ class PowerMonitor:
         """One step of the stepping thread, without its clock."""
         sample = None if self._power is None else self._power.fresh(now_ns, STALE_NS)
         thermal = None if self._heat is None else self._heat.fresh(now_ns, THERMAL_STALE_NS)
-        felt = self._feel(thermal)
+        heat = self._judge_heat(thermal)
         events = None if self._events is None else self._events.fresh(now_ns, 10 * THERMAL_STALE_NS)
         battery = None if self._battery is None else self._battery()
         if battery is not None and now_ns - battery.received_ns > BATTERY_STALE_NS:
             battery = None
         activity = self._activity()
-        reasoning, generations, reasoning_s = self._count(activity, now_ns)
         outputs = self._governor.step(
             GovernorInputs(
                 power_w=None if sample is None else sample.total_w,
-                reasoning=reasoning,
-                reasoning_s=reasoning_s,
-                generations=generations,
+                reasoning=activity.reasoning,
+                reasoning_s=activity.reasoning_s,
+                generations=activity.generations,
                 abandoned=activity.abandoned,
-                throttled=felt is not None and felt.throttled,
-                throttle_margin_c=None if felt is None else felt.throttle_margin_c,
-                trip_margin_c=None if felt is None else felt.trip_margin_c,
+                throttled=heat is not None and heat.throttled,
+                throttle_margin_c=None if heat is None else heat.throttle_margin_c,
+                trip_margin_c=None if heat is None else heat.trip_margin_c,
                 battery_percent=None if battery is None else battery.soc_percent,
             ),
             now_ns,
@@ -243,15 +222,15 @@ class PowerMonitor:
         self._snapshot = PowerSnapshot(now_ns, sample, outputs, thermal, battery, error, events or {})
         return self._snapshot
 
-    def _feel(self, thermal: ThermalState | None) -> ThermalState | None:
-        """What heat is judged by: a source that worked and stands still, or leaves a distance out, cools nothing."""
-        last, lost = self._felt, self._felt is not None and thermal is None
+    def _judge_heat(self, thermal: ThermalState | None) -> ThermalState | None:
+        """The newest known distances: while a source gives no value or leaves a distance out, its last one counts."""
+        last, lost = self._judged_heat, self._judged_heat is not None and thermal is None
         if lost != self._heat_lost and self._say is not None:
             self._say(f"power: temperatures {'are not read: what heat limits stays as it is' if lost else 'are read'}")
         self._heat_lost = lost
         if thermal is not None:
             passive_c, trip_c = thermal.throttle_margin_c, thermal.trip_margin_c
-            self._felt = (
+            self._judged_heat = (
                 thermal
                 if last is None
                 else replace(
@@ -260,23 +239,10 @@ class PowerMonitor:
                     trip_margin_c=last.trip_margin_c if trip_c is None else trip_c,
                 )
             )
-        return self._felt
+        return self._judged_heat
 
     def _sources(self) -> list[_Source[Any]]:
         return [source for source in (self._power, self._heat, self._events) if source is not None]
-
-    def _count(self, activity: Activity, now_ns: int) -> tuple[bool, int, float]:
-        """Counts that the program does not keep, from what it was doing at each step."""
-        last_ns, last_reasoning, generations, reasoning_s = self._counted or (now_ns, False, 0, 0.0)
-        if last_reasoning:
-            reasoning_s += (now_ns - last_ns) / 1e9
-            generations += not activity.reasoning
-        self._counted = (now_ns, activity.reasoning, generations, reasoning_s)
-        return (
-            activity.reasoning,
-            generations if activity.generations is None else activity.generations,
-            reasoning_s if activity.reasoning_s is None else activity.reasoning_s,
-        )
 
     def _run(self) -> None:
         while not self._stop.is_set():
@@ -294,13 +260,13 @@ class PowerMonitor:
             self._on_findings(tuple(Finding(name, _detail(name, snapshot)) for name in outputs.findings))
         if self._on_sample is not None:
             self._on_sample(snapshot.stamp_ns, snapshot.record())
-        if self._say is not None and outputs.says is not None:
-            self._say(f"power: {outputs.says}")
+        if self._say is not None and outputs.message is not None:
+            self._say(f"power: {outputs.message}")
 
     def _fail(self, why: str) -> None:
         """Without a governor nothing keeps the budget: reasoning stops, control goes on."""
         last = self._snapshot
-        outputs = GovernorOutputs(ReasoningBudget(allowed=False), level=GOVERNOR_LEVELS[OFF], says=why)
+        outputs = GovernorOutputs(ReasoningBudget(allowed=False), level=LEVELS[OFF], message=why)
         self._snapshot = PowerSnapshot(self._clock(), None, outputs, last.thermal, last.battery, why, last.over_current)
         if self._failed != why and self._say is not None:
             self._failed = why

@@ -1,4 +1,4 @@
-"""The power side of a run: the target's meter, its governor, and what the program tells them it is doing."""
+"""The power side of a run: the target's meter, its governor, and what both know of the program's activity."""
 
 from __future__ import annotations
 
@@ -10,11 +10,9 @@ from edge.artifacts.manifest import Artifacts
 from edge.core.sysfs import SYSFS
 from edge.power.governor.governor import Governor, GovernorConfig
 from edge.power.governor.plan import PowerPlan, read_power_plan
-from edge.power.meters.battery import ReadBattery
-from edge.power.meters.meter import MeterError, PowerMeter
-from edge.power.meters.overcurrent import OverCurrentEvents
+from edge.power.meters.meter import MeterError, PowerMeter, ReadBattery
 from edge.power.meters.select import open_meter
-from edge.power.meters.thermal import ThermalReader
+from edge.power.meters.thermal import OverCurrentEvents, ThermalReader
 from edge.power.monitor import Activity, PowerMonitor
 from edge.safety.faults.findings import Finding
 
@@ -31,19 +29,12 @@ def make_power_monitor(
 ) -> PowerMonitor:
     """The monitor of a target's power plan; raises ArtifactError.
 
-    Without the meter that the target names, its model stands in and the operator is told.
+    Without the meter that the target names, its model stands in and `say` gets a line.
     """
     plan = read_power_plan(artifacts)
-    meter = _meter(plan, lambda: _energy_j(plan, activity()), battery, say, sysfs_root)
-    config = GovernorConfig(
-        budget_w=plan.budget_w,
-        max_new_tokens=plan.max_new_tokens,
-        max_delay_s=plan.max_delay_s,
-        model=plan.model,
-    )
     return PowerMonitor(
-        meter,
-        Governor(config),
+        _meter(plan, lambda: _energy_j(plan, activity()), say, sysfs_root),
+        Governor(GovernorConfig(plan.budget_w, plan.max_new_tokens, plan.max_delay_s, plan.model)),
         activity=activity,
         thermal=ThermalReader(sysfs_root),
         battery=battery,
@@ -55,19 +46,13 @@ def make_power_monitor(
 
 
 def _meter(
-    plan: PowerPlan,
-    energy_j: Callable[[], float],
-    battery: ReadBattery,
-    say: Callable[[str], object],
-    sysfs_root: Path,
+    plan: PowerPlan, energy_j: Callable[[], float], say: Callable[[str], object], sysfs_root: Path
 ) -> PowerMeter | None:
     if plan.meter == "none":
         return None
     idle_w = None if plan.model is None else plan.model.idle_w
     try:
-        return open_meter(
-            plan.meter, sysfs_root=sysfs_root, rail=plan.rail, idle_w=idle_w, energy_j=energy_j, battery=battery
-        )
+        return open_meter(plan.meter, sysfs_root=sysfs_root, rail=plan.rail, idle_w=idle_w, energy_j=energy_j)
     except MeterError as error:
         instead = "nothing stands in for it" if idle_w is None else "the plan's model stands in for it"
         say(f"power: {error}; {instead}")
@@ -79,5 +64,5 @@ def _energy_j(plan: PowerPlan, activity: Activity) -> float:
     model = plan.model
     if model is None:
         return 0.0
-    reasoning_j = (activity.reasoning_s or 0.0) * model.reasoning_w(plan.max_new_tokens)
+    reasoning_j = activity.reasoning_s * model.reasoning_w(plan.max_new_tokens)
     return activity.ticks * (model.encode_j + model.act_j) + reasoning_j

@@ -42,7 +42,7 @@ from edge.run.session import RunSession
 from edge.state.switches import Decoding, RecoverySwitch, SwitchOptions
 from firmware_bridge.client import BridgeUnavailable
 from firmware_bridge.core.config import ConfigError, RobotConfig, load_robot_config
-from firmware_bridge.unitree.dds import DdsError
+from firmware_bridge.core.robot_state import DdsError
 
 EXAMPLES = """examples:
   edge-run --artifacts out/nano --robot go2.toml --instruction "walk to the vending machine"
@@ -169,7 +169,7 @@ def main(argv: list[str] | None = None) -> int:
     lines = operator_lines("edge-run")
     try:
         sessions: list[RunSession] = []
-        code = _run(args, lines.say, sessions)
+        code = _run(args, lines.write, sessions)
     finally:
         lines.close(LINES_S)
     if any(session.hung for session in sessions):

@@ -177,7 +177,7 @@ class ControlLoop:
                 self.tick(deadline_ns)
             if self.supervision.stop:
                 self.ended_by = "supervisor"
-                return self.supervision.says
+                return self.supervision.message
             status = self._sink.poll()
             now_ns = self._clock()
             silent_ns = 0 if status is None else now_ns - status.stamp_ns

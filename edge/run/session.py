@@ -30,7 +30,7 @@ from edge.run.robot_inputs import CommandTap, RobotInputs
 from edge.run.service import ServiceReporter
 from edge.safety.faults.findings import Finding
 from edge.safety.faults.table import FAULTS
-from edge.safety.reasoning_watch import Hang, ReasoningWatch
+from edge.safety.watchdog import Hang, ReasoningWatch
 from firmware_bridge.client import BridgeClient, BridgeStatus, BridgeUnavailable
 from firmware_bridge.core.config import RobotConfig
 from firmware_bridge.notify import Notifier
@@ -48,7 +48,7 @@ STOP_CONFIRM_S = 1.0
 """Of it, the most until the bridge confirms that it has sent zero velocity."""
 STANDSTILL_S = 2.0
 """Time for the robot to come to rest and report it, s."""
-STOP_PHRASE = f"{FAULTS['stop-phrase'].says} {FAULTS['stop-phrase'].advice}"
+STOP_PHRASE = f"{FAULTS['stop-phrase'].message} {FAULTS['stop-phrase'].advice}"
 """Fault that ends a run when the instruction channel brings a stop phrase."""
 LINES = 200
 """Lines for the operator that wait to be printed; more are dropped, oldest first."""
@@ -274,7 +274,7 @@ class RunSession:
         def in_the_way() -> str:
             if self._finished.is_set():
                 raise RefusedError(self._faults[0])
-            return loops.pre_arm.in_the_way()
+            return loops.pre_arm.blocking_fault()
 
         return arm(
             bridge,
@@ -351,8 +351,8 @@ class RunSession:
         while not self._finished.wait(POLL_S):
             if self._stop_requested:
                 self._stop.set()
-            if loops.control.supervision.says != says:
-                says = loops.control.supervision.says
+            if loops.control.supervision.message != says:
+                says = loops.control.supervision.message
                 self._print(says or "all faults have cleared")
             self._print_lines()
             self._take_instructions(channel, loops)
@@ -360,11 +360,11 @@ class RunSession:
                 reasoning.last_progress_ns, reasoning.times.generation_ms.quantile(1.0), time.monotonic_ns()
             )
             if hang is Hang.INTERRUPT:
-                self._print(f"reasoning has been in one call for {watch.stood_s:.0f} s; it is interrupted")
+                self._print(f"reasoning has been in one call for {watch.hung_s:.0f} s; it is interrupted")
                 reasoning.cancel()
             elif hang is Hang.GIVE_UP and not self.hung:
                 self.hung = True
-                inputs.findings.put((Finding("reasoning-hung", f"for {watch.stood_s:.0f} s"),))
+                inputs.findings.put((Finding("reasoning-hung", f"for {watch.hung_s:.0f} s"),))
 
     def _halt(self, bridge: BridgeClient, end: Deadline) -> BridgeStatus | None:
         """Wait until the bridge has put zero on the wire (it does so in any case, within its deadman)."""

@@ -51,7 +51,7 @@ class FaultEvent:
 
 @dataclass(frozen=True)
 class SupervisorOutputs:
-    """What the robot may do now, and what the operator is told."""
+    """What the robot may do now, and the line for the operator."""
 
     state: State
     speed_scale: float
@@ -62,7 +62,7 @@ class SupervisorOutputs:
     """Names of the faults that are there now, the worst first."""
     events: tuple[FaultEvent, ...]
     """What began and ended in this step."""
-    says: str
+    message: str
     """One line for the operator: the worst fault and what to do next; empty while there is none."""
 
 
@@ -107,7 +107,7 @@ class Supervisor:
             stop=self._stopped,
             active=tuple(entry.fault.name for entry in self._ordered),
             events=tuple(events),
-            says="" if worst is None else _sentence(worst),
+            message="" if worst is None else _sentence(worst),
         )
 
     def _state(self, armed: bool, zero: bool) -> State:
@@ -128,7 +128,7 @@ class Supervisor:
             events.append(FaultEvent(now_ns, fault, True, finding.detail))
             self._stopped = self._stopped or fault.latch
         else:
-            # The detail stays that of the beginning: the operator is told a fault once, not in every tick.
+            # The detail stays that of the beginning: the operator reads one line for a fault, not one a tick.
             entry.speed_scale, entry.seen_ns = scale, now_ns
         if fault.escalation is not None:
             instants = self._instants[fault.name]
@@ -146,4 +146,4 @@ class Supervisor:
 
 def _sentence(entry: _Active) -> str:
     detail = f" ({entry.detail})" if entry.detail else ""
-    return f"{entry.fault.says.removesuffix('.')}{detail}. {entry.fault.advice}"
+    return f"{entry.fault.message.removesuffix('.')}{detail}. {entry.fault.advice}"

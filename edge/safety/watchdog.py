@@ -1,20 +1,30 @@
-"""When the runner may tell systemd's watchdog that it works: only while the control thread ticks on time.
+"""Whether the runner's threads still make progress: when to feed systemd's watchdog, when to give up on reasoning.
 
-A process whose control thread is late, hung or dead must not be kept alive by a thread that knows nothing of it.
+A process whose control thread is late, hung or dead must not be kept alive by another thread. Nothing can end a
+reasoning thread that hangs in a driver: after an interrupt without effect only a new process helps.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from enum import Enum
 from typing import Final
 
 WINDOW_TICKS: Final = 10
 NEEDED_ON_TIME: Final = 8
 """Of the last WINDOW_TICKS; one or two late ticks are the bridge's business (its deadman), not a reason to restart."""
+CALL_MS: Final = 10_000.0
+"""Time that every call may take."""
+GENERATIONS: Final = 3.0
+"""Multiple of the longest generation so far that a call may take: a single call is a part of one."""
+GIVE_UP_NS: Final = 20_000_000_000
+"""After the interrupt. Fault matrix row 17 wants reasoning back within 30 s; the robot stands by then (its age)."""
+MAX_STEP_NS: Final = 1_000_000_000
+"""The most that one step counts: a process that was frozen has not hung."""
 
 
 class WatchdogFeeder:
-    """Pure: told of every tick, says when a ping is due. No clock, no socket."""
+    """Decides from every tick when a ping is due. No clock, no socket."""
 
     def __init__(self, *, ping_period_ns: int | None, tick_period_ns: int) -> None:
         """`ping_period_ns`: `Notifier.watchdog_period_ns`; None: no ping is ever due. Raises ValueError."""
@@ -44,3 +54,41 @@ class WatchdogFeeder:
             return False  # the next tick is not too late for it
         self._pinged_ns = now_ns
         return True
+
+
+class Hang(Enum):
+    """What to do about a call that hangs."""
+
+    NONE = "none"
+    INTERRUPT = "interrupt"
+    """Once for each hang."""
+    GIVE_UP = "give up"
+
+
+class ReasoningWatch:
+    """Decides from the time at which the reasoning thread was last between two calls. No clock."""
+
+    def __init__(self) -> None:
+        self._progress_ns: int | None = None
+        self._stepped_ns = 0
+        self._hung_ns = 0
+        self._interrupted_ns: int | None = None
+
+    def step(self, progress_ns: int, longest_ms: float | None, now_ns: int) -> Hang:
+        """`progress_ns`: `ReasoningLoop.last_progress_ns`; `longest_ms`: the longest generation so far, if any."""
+        if progress_ns != self._progress_ns:
+            self._progress_ns, self._hung_ns, self._interrupted_ns = progress_ns, 0, None
+        else:
+            self._hung_ns += min(max(0, now_ns - self._stepped_ns), MAX_STEP_NS)
+        self._stepped_ns = now_ns
+        if self._interrupted_ns is not None:
+            return Hang.GIVE_UP if self._hung_ns - self._interrupted_ns >= GIVE_UP_NS else Hang.NONE
+        if self._hung_ns < max(CALL_MS, GENERATIONS * (longest_ms or 0.0)) * 1e6:
+            return Hang.NONE
+        self._interrupted_ns = self._hung_ns
+        return Hang.INTERRUPT
+
+    @property
+    def hung_s(self) -> float:
+        """For how long there has been no progress."""
+        return self._hung_ns / 1e9

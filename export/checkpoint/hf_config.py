@@ -9,17 +9,16 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from export.checkpoint.coverage import CheckpointError
 from export.checkpoint.sources import read_json
 from export.model.config import LanguageConfig, ModelConfigError, TicVlaConfig, VisionConfig
+from export.model.weights import CheckpointError
 
 CONFIG = "config.json"
 PREPROCESSOR = "preprocessor_config.json"
-_NO_DEFAULT = object()
 N = TypeVar("N", int, float)
 
 Demand = tuple[str, tuple[Any, ...], Any]
@@ -71,7 +70,7 @@ _HF_VISION_DEFAULTS = {
 
 @dataclass(frozen=True)
 class HfConfig:
-    """What a directory says of its network."""
+    """The network of a directory."""
 
     vision: VisionConfig
     language: LanguageConfig
@@ -79,129 +78,131 @@ class HfConfig:
     """The output head is the embedding: a file without a head is complete."""
 
 
-def config_from_hf(directory: Path) -> tuple[VisionConfig, LanguageConfig]:
-    """Encoder and language model of an InternVL directory; raises CheckpointError naming what we do not implement.
+@dataclass(frozen=True)
+class _Section:
+    """A table of config.json, whose keys are refused by their full name."""
 
-    Token ids and `max_context` are not in config.json and keep the defaults of `LanguageConfig`.
-    """
-    config = read_hf_config(directory, LanguageConfig())
-    return config.vision, config.language
+    where: str
+    content: Mapping[str, Any]
+    defaults: Mapping[str, int] = field(default_factory=dict)
+
+    def below(
+        self, key: str, called: str, demands: tuple[Demand, ...], defaults: Mapping[str, int] | None = None
+    ) -> _Section:
+        """A section that keeps the demands."""
+        section = self.content.get(key)
+        if not isinstance(section, dict):
+            raise CheckpointError(f"{self.where}has no {key}")
+        found = _Section(f"{self.where}{called}.", section, defaults or {})
+        found.demand(demands)
+        return found
+
+    def demand(self, demands: tuple[Demand, ...]) -> None:
+        """Refuse a value that this network does not implement."""
+        for key, accepted, default in demands:
+            value = self.content.get(key, default)
+            if value not in accepted:
+                expected = " or ".join(repr(a) for a in accepted)
+                raise CheckpointError(f"{self.where}{key} is {value!r}, this network implements {expected}")
+
+    def number(self, key: str, kind: type[N], default: object = None) -> N:
+        """A number; of a square's two sides either."""
+        value = self.content.get(key, self.defaults.get(key, default))
+        if isinstance(value, list) and len(value) == 2 and value[0] == value[1]:
+            value = value[0]
+        if kind is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if not isinstance(value, kind) or isinstance(value, bool):
+            found = "not there" if value is None else repr(value)
+            raise CheckpointError(f"{self.where}{key} is {found}, expected {kind.__name__}")
+        return value
 
 
 def read_hf_config(directory: Path, ours: LanguageConfig) -> HfConfig:
-    """config.json in either layout; `ours` gives what it does not say (token ids, `max_context`)."""
-    top = read_json(directory, CONFIG)
+    """config.json in either layout; `ours` gives what it does not have (token ids, `max_context`).
+
+    Raises CheckpointError naming what this network does not implement.
+    """
+    content = read_json(directory, CONFIG)
     where = f"{directory.resolve().name}/{CONFIG}"
+    top = _Section(f"{where}: ", content)
     try:
-        if "llm_config" in top:
-            return _chat(where, top, directory, ours)
-        if "text_config" in top:
-            return _hugging_face(where, top, directory, ours)
+        if "llm_config" in content:
+            top.demand(_CHAT)
+            vision = top.below("vision_config", "vision_config", _CHAT_VISION)
+            return _read(top, directory, ours, vision, top.below("llm_config", "text_config", _QWEN2))
+        if "text_config" in content:
+            top.demand(_HF)
+            vision = top.below("vision_config", "vision_config", _HF_VISION, _HF_VISION_DEFAULTS)
+            image_id = top.number("image_token_id", int, 151667)
+            ours = dataclasses.replace(ours, img_context_id=image_id) if image_id != ours.img_context_id else ours
+            return _read(top, directory, ours, vision, top.below("text_config", "text_config", _QWEN2))
     except (ModelConfigError, OverflowError) as error:
         raise CheckpointError(f"{where}: {error}") from error
-    found = top.get("model_type", top.get("architectures", "neither"))
+    found = content.get("model_type", content.get("architectures", "neither"))
     raise CheckpointError(f"{where}: expected InternVL's llm_config or text_config; found {found!r}")
 
 
 def check_config(directory: Path, config: TicVlaConfig) -> HfConfig:
     """Refuse a directory whose config.json contradicts `config`; raises CheckpointError naming the numbers."""
-    said = read_hf_config(directory, config.language)
+    theirs = read_hf_config(directory, config.language)
     pairs = []
-    for section, theirs in (("vision", said.vision), ("language", said.language)):
-        ours = getattr(config, section)
-        for field in dataclasses.fields(theirs):
-            a, b = getattr(theirs, field.name), getattr(ours, field.name)
+    for section in ("vision", "language"):
+        for key, b in vars(getattr(config, section)).items():
+            a = getattr(getattr(theirs, section), key)
             # The layer scale's initial value has no part in a network whose weights are loaded.
-            if a != b and field.name != "layer_scale_init":
-                pairs.append(f"{section}.{field.name} is {a}, model {config.name!r} has {b}")
+            if a != b and key != "layer_scale_init":
+                pairs.append(f"{section}.{key} is {a}, model {config.name!r} has {b}")
     if pairs:
         more = f" and {len(pairs) - 3} more" if len(pairs) > 3 else ""
         raise CheckpointError(
             f"{directory.resolve().name}/{CONFIG}: {'; '.join(pairs[:3])}{more}: "
             "choose the --model this checkpoint was made for"
         )
-    return said
+    return theirs
 
 
-def _chat(where: str, top: Mapping[str, object], directory: Path, ours: LanguageConfig) -> HfConfig:
-    vision, text = _section(where, top, "vision_config"), _section(where, top, "llm_config")
-    _demand(where, "", top, _CHAT)
-    _demand(where, "vision_config.", vision, _CHAT_VISION)
-    return _assemble(where, top, directory, ours, (vision, {}), text)
-
-
-def _hugging_face(where: str, top: Mapping[str, object], directory: Path, ours: LanguageConfig) -> HfConfig:
-    vision, text = _section(where, top, "vision_config"), _section(where, top, "text_config")
-    _demand(where, "", top, _HF)
-    _demand(where, "vision_config.", vision, _HF_VISION)
-    image_id = _number(where, "", top, "image_token_id", int, 151667)
-    ours = dataclasses.replace(ours, img_context_id=image_id) if image_id != ours.img_context_id else ours
-    return _assemble(where, top, directory, ours, (vision, _HF_VISION_DEFAULTS), text)
-
-
-def _assemble(
-    where: str,
-    top: Mapping[str, Any],
-    directory: Path,
-    ours: LanguageConfig,
-    tower: tuple[Mapping[str, Any], Mapping[str, Any]],
-    text: Mapping[str, Any],
-) -> HfConfig:
-    _demand(where, "text_config.", text, _QWEN2)
-    if any(kind != "full_attention" for kind in text.get("layer_types") or ()):
-        raise CheckpointError(f"{where}: layer_types has {text['layer_types']!r}, only full_attention is implemented")
-    head_dim = text.get("head_dim")
-    hidden, heads = (_number(where, "text_config.", text, key, int) for key in ("hidden_size", "num_attention_heads"))
+def _read(top: _Section, directory: Path, ours: LanguageConfig, vision: _Section, text: _Section) -> HfConfig:
+    content = text.content
+    if any(kind != "full_attention" for kind in content.get("layer_types") or ()):
+        raise CheckpointError(
+            f"{text.where}layer_types is {content['layer_types']!r}, only full_attention is implemented"
+        )
+    head_dim = content.get("head_dim")
+    hidden, heads = (text.number(key, int) for key in ("hidden_size", "num_attention_heads"))
     language = dataclasses.replace(
         ours,
         hidden=hidden,
-        layers=_number(where, "text_config.", text, "num_hidden_layers", int),
+        layers=text.number("num_hidden_layers", int),
         heads=heads,
-        kv_heads=_number(where, "text_config.", text, "num_key_value_heads", int),
+        kv_heads=text.number("num_key_value_heads", int),
         head_dim=head_dim if isinstance(head_dim, int) else hidden // max(heads, 1),
-        mlp=_number(where, "text_config.", text, "intermediate_size", int),
-        vocab=_number(where, "text_config.", text, "vocab_size", int),
-        rope_theta=_rope_theta(where, text, ours.max_context),
-        rms_eps=_number(where, "text_config.", text, "rms_norm_eps", float, 1e-6),
+        mlp=text.number("intermediate_size", int),
+        vocab=text.number("vocab_size", int),
+        rope_theta=_rope_theta(text, ours.max_context),
+        rms_eps=text.number("rms_norm_eps", float, 1e-6),
         token_merge=1,
     )
-    # transformers ties InternVL's head unless told not to; OpenGVLab's Qwen2 does not unless told to.
-    tied = top.get("tie_word_embeddings", text.get("tie_word_embeddings", "text_config" in top))
-    return HfConfig(_vision(where, top, directory, tower, hidden), language, bool(tied))
-
-
-def _vision(
-    where: str,
-    top: Mapping[str, object],
-    directory: Path,
-    tower: tuple[Mapping[str, object], Mapping[str, object]],
-    token_dim: int,
-) -> VisionConfig:
-    vision, defaults = tower
-
-    def size(key: str) -> int:
-        value = vision.get(key, defaults.get(key))
-        if isinstance(value, list) and len(value) == 2 and value[0] == value[1]:
-            value = value[0]
-        return _number(where, "vision_config.", {key: value}, key, int)
-
-    ratio = _number(where, "", top, "downsample_ratio", float, 0.5)
+    # By default transformers ties InternVL's head and OpenGVLab's Qwen2 does not.
+    tied = top.content.get("tie_word_embeddings", content.get("tie_word_embeddings", "text_config" in top.content))
+    ratio = top.number("downsample_ratio", float, 0.5)
     if ratio <= 0 or (1 / ratio) != round(1 / ratio):
-        raise CheckpointError(f"{where}: downsample_ratio is {ratio}, expected one over a whole number")
+        raise CheckpointError(f"{top.where}downsample_ratio is {ratio}, expected one over a whole number")
     mean, std = _normalisation(directory)
-    return VisionConfig(
-        image_px=size("image_size"),
-        patch_px=size("patch_size"),
-        hidden=size("hidden_size"),
-        layers=size("num_hidden_layers"),
-        heads=size("num_attention_heads"),
-        mlp=size("intermediate_size"),
-        layer_norm_eps=_number(where, "vision_config.", vision, "layer_norm_eps", float, 1e-6),
+    encoder = VisionConfig(
+        image_px=vision.number("image_size", int),
+        patch_px=vision.number("patch_size", int),
+        hidden=vision.number("hidden_size", int),
+        layers=vision.number("num_hidden_layers", int),
+        heads=vision.number("num_attention_heads", int),
+        mlp=vision.number("intermediate_size", int),
+        layer_norm_eps=vision.number("layer_norm_eps", float, 1e-6),
         pixel_shuffle=round(1 / ratio),
-        token_dim=token_dim,
+        token_dim=hidden,
         mean=mean,
         std=std,
     )
+    return HfConfig(encoder, language, bool(tied))
 
 
 def _normalisation(directory: Path) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
@@ -218,43 +219,16 @@ def _normalisation(directory: Path) -> tuple[tuple[float, float, float], tuple[f
     return found[0], found[1]
 
 
-def _rope_theta(where: str, text: Mapping[str, Any], max_context: int) -> float:
+def _rope_theta(text: _Section, max_context: int) -> float:
     """Base of the rotary angles; newer files keep it in `rope_parameters`, older ones beside `rope_scaling`."""
-    parameters = text.get("rope_parameters") or {}
-    scaling = text.get("rope_scaling") or parameters
+    parameters = text.content.get("rope_parameters") or {}
+    scaling = text.content.get("rope_scaling") or parameters
     kind = scaling.get("rope_type", scaling.get("type", "default"))
     if kind not in _ROPE_TYPES:
-        raise CheckpointError(f"{where}: rope_scaling of type {kind!r} is not implemented, expected {_ROPE_TYPES}")
+        raise CheckpointError(f"{text.where}rope_scaling of type {kind!r} is not implemented, expected {_ROPE_TYPES}")
     # Dynamic scaling acts on sequences beyond the trained length only, which are longer than any prompt of ours.
-    trained = _number(where, "text_config.", text, "max_position_embeddings", int, 32768)
+    trained = text.number("max_position_embeddings", int, 32768)
     if trained < max_context:
-        raise CheckpointError(f"{where}: max_position_embeddings is {trained}, the model reads {max_context}")
-    source = parameters if "rope_theta" in parameters else text
-    return _number(where, "text_config.", source, "rope_theta", float, 10000.0)
-
-
-def _section(where: str, top: Mapping[str, object], key: str) -> Mapping[str, Any]:
-    section = top.get(key)
-    if not isinstance(section, dict):
-        raise CheckpointError(f"{where}: has no {key}")
-    return section
-
-
-def _demand(where: str, prefix: str, section: Mapping[str, object], demands: tuple[Demand, ...]) -> None:
-    for key, accepted, default in demands:
-        value = section.get(key, default)
-        if value not in accepted:
-            expected = " or ".join(repr(a) for a in accepted)
-            raise CheckpointError(f"{where}: {prefix}{key} is {value!r}, this network implements {expected}")
-
-
-def _number(
-    where: str, prefix: str, section: Mapping[str, object], key: str, kind: type[N], default: object = _NO_DEFAULT
-) -> N:
-    value = section.get(key, default)
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
-    if not isinstance(value, kind) or isinstance(value, bool):
-        found = "not there" if value is _NO_DEFAULT or value is None else repr(value)
-        raise CheckpointError(f"{where}: {prefix}{key} is {found}, expected {kind.__name__}")
-    return value
+        raise CheckpointError(f"{text.where}max_position_embeddings is {trained}, the model reads {max_context}")
+    source = dataclasses.replace(text, content=parameters) if "rope_theta" in parameters else text
+    return source.number("rope_theta", float, 10000.0)

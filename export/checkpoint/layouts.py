@@ -33,14 +33,13 @@ class Layout:
 
     def names(self, config: TicVlaConfig) -> dict[str, tuple[str, ...]]:
         """Our tensor → their tensors, every layer written out."""
-        table = dict(_split(rule) for rule in (*self.vision, *self.language))
-        for rules, layers in (
+        rules = [*self.vision, *self.language]
+        for each, layers in (
             (self.vision_layers, config.vision.layers),
             (self.language_layers, config.language.layers),
         ):
-            for n in range(layers):
-                table.update(_split(tuple(name.replace("{n}", str(n)) for name in rule)) for rule in rules)
-        return table
+            rules += [tuple(name.replace("{n}", str(n)) for name in rule) for n in range(layers) for rule in each]
+        return {ours: tuple(theirs) for ours, *theirs in rules}
 
 
 @dataclass(frozen=True)
@@ -55,10 +54,6 @@ class Match:
     def describe(self) -> str:
         """Layout and prefix for the report."""
         return f"{self.layout}, prefix {self.prefix}" if self.prefix else self.layout
-
-
-def _split(rule: Rule) -> tuple[str, tuple[str, ...]]:
-    return rule[0], rule[1:]
 
 
 def _both(ours: str, *theirs: str) -> tuple[Rule, ...]:

@@ -5,26 +5,79 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Final
 
 import torch
+from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from export.checkpoint.coverage import CheckpointError, Coverage, SourceCoverage
 from export.checkpoint.hf_config import check_config
 from export.checkpoint.layouts import find_layouts
 from export.checkpoint.sources import Source, open_source
 from export.checkpoint.tokenizer import directory_tokenizer
 from export.core.cache import file_sha256
-from export.model.config import TicVlaConfig
-from export.model.config_file import config_from_dict
+from export.model.config import TicVlaConfig, config_from_dict
 from export.model.network import TicVla, empty_network, initialise
-from export.model.weights import FORMAT, WeightsInfo
+from export.model.weights import FORMAT, CheckpointError, WeightsInfo
 
+SHIPPED: Final = Path(__file__).parents[1] / "weights"
+"""Trained weights that come with the package."""
+SHOWN = 3
 EMBED, LM_HEAD = "language.embed.weight", "language.lm_head.weight"
 VALUE_SEED = 0
 """Of a value network that no file has: it is training's business and in no graph."""
+
+
+@dataclass(frozen=True)
+class SourceCoverage:
+    """One `--checkpoint`: how its tensors were read."""
+
+    label: str
+    layouts: tuple[str, ...]
+    """Names of the layouts found, each with the prefix its tensors carry ("internvl, prefix vlm.")."""
+    tensors: int
+    loaded: int
+    ignored: tuple[str, ...] = ()
+    """Tensors that hold nothing to load (buffers computed from the configuration)."""
+    outside: tuple[str, ...] = ()
+    """Entries beside the weights (optimizer state and the like) that were not read."""
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Every tensor of the files and of the network accounted for."""
+
+    sources: tuple[SourceCoverage, ...] = ()
+    loaded: dict[str, str] = field(default_factory=dict)
+    """Tensor of the network → "file: tensor[, tensor …]" it was read from."""
+    seeded: dict[str, int] = field(default_factory=dict)
+    """Part of the network that no file has → the seed of its random weights."""
+    missing: tuple[str, ...] = ()
+    unknown: tuple[str, ...] = ()
+    misshaped: tuple[str, ...] = ()
+    repeated: tuple[str, ...] = ()
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing is missing, unknown, of another shape or given twice."""
+        return not (self.missing or self.unknown or self.misshaped or self.repeated)
+
+    def difference(self) -> str:
+        """The difference in one line: a count and the first few names of each kind."""
+        kinds = {
+            "missing": self.missing,
+            "unknown": self.unknown,
+            "of another shape": self.misshaped,
+            "given twice": self.repeated,
+        }
+        return "; ".join(
+            f"{len(names)} tensor{'s'[: len(names) != 1]} {kind} ({', '.join(names[:SHOWN])}"
+            f"{', …' if len(names) > SHOWN else ''})"
+            for kind, names in kinds.items()
+            if names
+        )
 
 
 @dataclass(frozen=True)
@@ -38,25 +91,19 @@ class LoadedCheckpoint:
     """tokenizer.json of the Hugging Face directory, checked against the configuration's token ids."""
 
 
-@dataclass(frozen=True)
-class _Recipe:
-    """How one of our tensors is read: the pieces are stacked along the first axis."""
-
-    source: Source
-    names: tuple[str, ...]
-
-    def describe(self) -> str:
-        return f"{self.source.label}: {', '.join(self.names)}"
-
-
 @dataclass
 class _Plan:
     """What the files give, before anything is read."""
 
-    recipes: dict[str, _Recipe]
-    sources: list[SourceCoverage]
-    unknown: list[str]
-    repeated: list[str]
+    recipes: dict[str, tuple[Source, tuple[str, ...]]] = field(default_factory=dict)
+    """Our tensor → the file and the names of the pieces there, which are stacked along the first axis."""
+    sources: list[SourceCoverage] = field(default_factory=list)
+    unknown: list[str] = field(default_factory=list)
+    repeated: list[str] = field(default_factory=list)
+
+
+def _describe(source: Source, names: tuple[str, ...]) -> str:
+    return f"{source.label}: {', '.join(names)}"
 
 
 def load_checkpoint(paths: Sequence[Path], config: TicVlaConfig, *, fill_seed: int | None) -> LoadedCheckpoint:
@@ -81,7 +128,7 @@ def load_checkpoint(paths: Sequence[Path], config: TicVlaConfig, *, fill_seed: i
     coverage = _account(plan, wanted, fill_seed)
     if not coverage.complete:
         _refuse(coverage, config, sources)
-    _read(model, plan.recipes)
+    _read(model, plan)
     for part, seed in coverage.seeded.items():
         initialise(model, seed, (part,))
     contents = (directory_tokenizer(s.directory, config.language) for s in sources if s.directory is not None)
@@ -90,7 +137,7 @@ def load_checkpoint(paths: Sequence[Path], config: TicVlaConfig, *, fill_seed: i
 
 
 def _check_own_config(source: Source, config: TicVlaConfig) -> None:
-    """A file of ours says which network it was made for: another one is refused even where all shapes fit."""
+    """A file of ours names its network: another one is refused even where all shapes fit."""
     written = source.metadata.get("format", "")
     if written.split("/")[0] != FORMAT.split("/")[0]:
         return
@@ -98,12 +145,12 @@ def _check_own_config(source: Source, config: TicVlaConfig) -> None:
         raise CheckpointError(f"{source.label}: format {written!r}, expected {FORMAT!r}")
     try:
         # A number that an older file does not know of: the usual value is what there was before it.
-        said, ours = asdict(config_from_dict(json.loads(source.metadata["config"]))), asdict(config)
+        theirs, ours = asdict(config_from_dict(json.loads(source.metadata["config"]))), asdict(config)
         differ = [
-            f"{section}.{key} is {said[section][key]!r}, expected {value!r}"
+            f"{section}.{key} is {theirs[section][key]!r}, expected {value!r}"
             for section in ("vision", "language", "action", "value")
             for key, value in ours[section].items()
-            if said[section][key] != value
+            if theirs[section][key] != value
         ]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise CheckpointError(f"{source.label}: its configuration is not readable; was it changed?") from error
@@ -114,13 +161,13 @@ def _check_own_config(source: Source, config: TicVlaConfig) -> None:
 
 
 def _plan(sources: Sequence[Source], wanted: dict[str, tuple[int, ...]], config: TicVlaConfig) -> _Plan:
-    plan = _Plan({}, [], [], [])
+    plan = _Plan()
     for source in sources:
         matches = find_layouts(source.tensors, wanted, config)
         if not matches:
-            shown = ", ".join(list(source.tensors)[:3]) or "no tensors"
+            names = ", ".join(list(source.tensors)[:3]) or "no tensors"
             raise CheckpointError(
-                f"{source.label}: tensors of no layout that is known ({shown}); expected InternVL, InternVL-hf or "
+                f"{source.label}: tensors of no layout that is known ({names}); expected InternVL, InternVL-hf or "
                 f"{FORMAT} names"
             )
         used: set[str] = set()
@@ -130,9 +177,9 @@ def _plan(sources: Sequence[Source], wanted: dict[str, tuple[int, ...]], config:
                     continue
                 used.update(theirs)
                 if ours in plan.recipes:
-                    plan.repeated.append(f"{ours} in {plan.recipes[ours].source.label} and {source.label}")
+                    plan.repeated.append(f"{ours} in {plan.recipes[ours][0].label} and {source.label}")
                 else:
-                    plan.recipes[ours] = _Recipe(source, theirs)
+                    plan.recipes[ours] = (source, theirs)
         rest = [name for name in source.tensors if name not in used]
         patterns = [pattern for match in matches for pattern in match.ignored]
         ignored = tuple(name for name in rest if any(re.fullmatch(pattern, name) for pattern in patterns))
@@ -165,17 +212,14 @@ def _account(plan: _Plan, wanted: dict[str, tuple[int, ...]], fill_seed: int | N
         if recipe is None:
             missing.append(name)
             continue
-        tensors = recipe.source.tensors
-        missing += [f"{recipe.source.label}: {piece}" for piece in recipe.names if piece not in tensors]
-        expected = (shape[0] // len(recipe.names), *shape[1:]) if len(recipe.names) > 1 else shape
-        misshaped += [
-            f"{piece} is {list(tensors[piece].shape)}, expected {list(expected)}"
-            for piece in recipe.names
-            if piece in tensors and tensors[piece].shape != expected
-        ]
+        source, pieces = recipe
+        missing += [f"{source.label}: {piece}" for piece in pieces if piece not in source.tensors]
+        expected = (shape[0] // len(pieces), *shape[1:]) if len(pieces) > 1 else shape
+        found = {piece: source.tensors[piece].shape for piece in pieces if piece in source.tensors}
+        misshaped += [f"{p} is {list(s)}, expected {list(expected)}" for p, s in found.items() if s != expected]
     return Coverage(
         sources=tuple(plan.sources),
-        loaded={name: recipe.describe() for name, recipe in plan.recipes.items()},
+        loaded={name: _describe(*recipe) for name, recipe in plan.recipes.items()},
         seeded=seeded,
         missing=tuple(missing),
         unknown=tuple(plan.unknown),
@@ -196,30 +240,46 @@ def _refuse(coverage: Coverage, config: TicVlaConfig, sources: Sequence[Source])
         if absent == ["action"]:
             hint += ", or ask for untrained weights with --random-weights SEED"
         parts = " and no ".join(names[part] for part in absent)
-        raise CheckpointError(f"{labels}: no {parts} ({len(coverage.missing)} tensors); {hint}", coverage)
-    raise CheckpointError(f"{labels}: not the network of model {config.name!r}: {coverage.difference()}", coverage)
+        raise CheckpointError(f"{labels}: no {parts} ({len(coverage.missing)} tensors); {hint}")
+    raise CheckpointError(f"{labels}: not the network of model {config.name!r}: {coverage.difference()}")
 
 
-def _read(model: TicVla, recipes: dict[str, _Recipe]) -> None:
+def _read(model: TicVla, plan: _Plan) -> None:
     targets = model.state_dict()
-    for ours, recipe in recipes.items():
+    for ours, (source, pieces) in plan.recipes.items():
         target: Tensor = targets[ours]
-        rows = target.shape[0] // len(recipe.names) if target.ndim else 0
-        for i, name in enumerate(recipe.names):
-            # fp32 from bf16 and fp16 is exact; copying also frees the network from the file it came from.
-            tensor = recipe.source.tensors[name].read()
-            (target[i * rows : (i + 1) * rows] if len(recipe.names) > 1 else target).copy_(tensor)
+        # fp32 from bf16 and fp16 is exact; copying also frees the network from the file it came from.
+        for part, piece in zip(target.chunk(len(pieces)) if len(pieces) > 1 else [target], pieces, strict=True):
+            part.copy_(source.tensors[piece].read())
         if not torch.isfinite(target).all():
-            raise CheckpointError(f"{recipe.describe()}: has values that are not finite; the file is damaged")
+            raise CheckpointError(f"{_describe(source, pieces)}: has values that are not finite; the file is damaged")
 
 
 def _info(sources: Sequence[Source], coverage: Coverage) -> WeightsInfo:
-    """Origin by file name and hash; trained unless a file of ours or a seed says otherwise."""
+    """Origin by file name and hash; untrained by the metadata of a file of ours or by a seed."""
     parts = []
     for source in sources:
-        said = source.metadata.get("origin", "")
-        suffix = f", {said}" if said else ""
+        origin = source.metadata.get("origin", "")
+        suffix = f", {origin}" if origin else ""
         parts += [f"{label} (sha256 {file_sha256(path)}{suffix})" for label, path in source.files.items()]
     parts += [f"{part}: random seed {seed}" for part, seed in coverage.seeded.items()]
     untrained = "action" in coverage.seeded or any(s.metadata.get("trained") == "false" for s in sources)
     return WeightsInfo(trained=not untrained, origin="; ".join(parts))
+
+
+def shipped_weights(config: TicVlaConfig, folder: Path = SHIPPED) -> Path | None:
+    """The file for this very network; None if there is none. Raises CheckpointError for one that cannot be read.
+
+    A network of that name with changed numbers (`--set model.…`) has none: it would have to be trained.
+    """
+    path = folder / f"{config.name}.safetensors"
+    if not path.is_file():
+        return None
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            written = config_from_dict(json.loads((file.metadata() or {})["config"]))
+        return path if written == config else None
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(
+            f"{path}: the shipped weights cannot be read ({error}); install the package again"
+        ) from error

@@ -1,4 +1,4 @@
-"""Which tokenizer an artifact directory gets, and whether it says what the network's token ids mean."""
+"""Which tokenizer an artifact directory gets, checked against the network's token ids."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from pathlib import Path
 
 from tokenizers import Tokenizer
 
-from export.checkpoint.coverage import CheckpointError
 from export.checkpoint.sources import inside
 from export.model.config import PRESETS, LanguageConfig, TicVlaConfig
 from export.model.tokenizers.internvl import TokenizerError, build_tokenizer
 from export.model.tokenizers.nano import NANO_TOKENIZER
+from export.model.weights import CheckpointError
 
 TOKENIZER = "tokenizer.json"
 MAX_TOKENIZER_BYTES = 64 << 20

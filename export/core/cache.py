@@ -16,7 +16,7 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -68,7 +68,9 @@ def source_sha256(modules: tuple[str, ...]) -> str:
     waiting, found = list(modules), dict[str, Path]()
     while waiting:
         name = waiting.pop()
-        path = _module_file(root, name)
+        stem = root.joinpath(*name.split("."))
+        candidates = (stem.with_suffix(".py"), stem / "__init__.py")
+        path = next((path for path in candidates if path.is_file()), None)  # None for a name inside a module
         if path is not None and name not in found:
             found[name] = path
             waiting += [imported for imported in _imports(path) if imported.split(".")[0] in SOURCE_FOLDERS]
@@ -77,13 +79,6 @@ def source_sha256(modules: tuple[str, ...]) -> str:
     for path in sorted({*found.values(), *data}):
         digest.update(f"{path.relative_to(root).as_posix()}:{file_sha256(path)}\n".encode())
     return digest.hexdigest()
-
-
-def _module_file(root: Path, name: str) -> Path | None:
-    """A module's file; None for a name inside a module."""
-    stem = root.joinpath(*name.split("."))
-    candidates = [stem.with_suffix(".py"), stem / "__init__.py"]
-    return next((path for path in candidates if path.is_file()), None)
 
 
 def _imports(path: Path) -> set[str]:
@@ -146,7 +141,8 @@ def open_cache(directory: Path, limit_bytes: int, say: Callable[[str], None]) ->
         try:
             yield cache
         finally:
-            if _try_lock(descriptor):
+            with suppress(BlockingIOError):  # another process has it open
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 cache.prune(limit_bytes)
     finally:
         os.close(descriptor)
@@ -164,14 +160,6 @@ def _claim(directory: Path) -> None:
             f"cache {directory}: holds {others[0]}, which no cache of ours does; name an empty or a new directory"
         )
     marker.touch()
-
-
-def _try_lock(descriptor: int) -> bool:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
 
 
 @dataclass(frozen=True)
@@ -244,11 +232,12 @@ class StageCache:
         for leftover in [path for path in ours if path.suffix]:
             shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
         entries = [path for path in ours if not path.suffix and path.is_dir()]
-        total = sum(map(_size_bytes, entries))
-        for entry in sorted(entries, key=_last_used_ns):
-            if total <= limit_bytes:
+        sizes = {entry: sum(path.stat().st_size for path in entry.iterdir()) for entry in entries}
+        used_ns = {entry: max((p.stat().st_mtime_ns for p in entry.glob(ENTRY_NAME)), default=0) for entry in entries}
+        for entry in sorted(entries, key=lambda entry: used_ns[entry]):
+            if sum(sizes.values()) <= limit_bytes:
                 return
-            total -= _size_bytes(entry)
+            del sizes[entry]
             shutil.rmtree(entry)
 
     @contextmanager
@@ -284,12 +273,3 @@ def _damage(entry: Path) -> str | None:
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         return f"{entry.name[:12]}… cannot be read ({error})"
     return None
-
-
-def _size_bytes(entry: Path) -> int:
-    return sum(path.stat().st_size for path in entry.iterdir())
-
-
-def _last_used_ns(entry: Path) -> int:
-    record = entry / ENTRY_NAME
-    return record.stat().st_mtime_ns if record.exists() else 0

@@ -5,16 +5,28 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+import sys
 import types
 import typing
 from collections.abc import Mapping
 from typing import Any, TypeVar
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+__all__ = ["FieldError", "SettingText", "build", "convert", "field_types", "from_text", "near", "plain", "tomllib"]
 
 T = TypeVar("T")
 
 
 class FieldError(ValueError):
     """A key that is not known, a key that is missing or a value of another type; its text is the one line to show."""
+
+
+class SettingText(str):
+    """A value as the command line gives it; `convert` reads it as its field's type."""
 
 
 def near(name: str, known: typing.Iterable[str]) -> str:
@@ -54,7 +66,10 @@ def build(cls: type[T], content: object, where: str) -> T:
 
 
 def convert(kind: object, value: object, where: str) -> Any:
-    """`value` as the type `kind`; raises FieldError."""
+    """`value` as the type `kind`; raises FieldError. A dataclass may read a setting by a `from_setting` of its own."""
+    if isinstance(value, SettingText):
+        own = [option for option in (kind, *typing.get_args(kind)) if hasattr(option, "from_setting")]
+        value = own[0].from_setting(str(value), where) if own else from_text(kind, str(value), where)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
         options = [option for option in arguments if option is not type(None)]
@@ -66,12 +81,14 @@ def convert(kind: object, value: object, where: str) -> Any:
         matching = [option for option in options if type(value) is option]
         if matching:
             return value
-        raise FieldError(f"{where}: expected {kind_name(kind)}, found {value!r}")
+        raise FieldError(f"{where}: expected {_kind_name(kind)}, found {value!r}")
     if isinstance(kind, type) and dataclasses.is_dataclass(kind):
         return value if isinstance(value, kind) else build(kind, value, where)
     if origin is tuple:
         if not isinstance(value, list | tuple):
             raise FieldError(f"{where}: expected a list, found {value!r}")
+        if arguments[-1] is not Ellipsis and len(value) != len(arguments):
+            raise FieldError(f"{where}: expected a list of {len(arguments)} values, found {value!r}")
         return tuple(convert(arguments[0], item, f"{where}[{i}]") for i, item in enumerate(value))
     if origin is not None and issubclass(origin, Mapping):
         if not isinstance(value, Mapping):
@@ -82,7 +99,7 @@ def convert(kind: object, value: object, where: str) -> Any:
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value) if abs(value) < 2**53 else math.inf
     if type(value) is not kind or (kind is float and not math.isfinite(typing.cast(float, value))):
-        raise FieldError(f"{where}: expected {kind_name(kind)}, found {value!r}")
+        raise FieldError(f"{where}: expected {_kind_name(kind)}, found {value!r}")
     return value
 
 
@@ -99,9 +116,11 @@ def from_text(kind: object, text: str, where: str) -> Any:
             except FieldError:
                 if option is options[-1] and len(options) == 1:
                     raise
-        raise FieldError(f"{where}: expected {kind_name(kind)}, found {text!r}")
+        raise FieldError(f"{where}: expected {_kind_name(kind)}, found {text!r}")
     if origin is tuple:
-        return [from_text(arguments[0], part.strip(), where) for part in text.split(",") if part.strip()]
+        # "24,48" and "[24, 48]" are the same list.
+        parts = text.strip().removeprefix("[").removesuffix("]").split(",")
+        return [from_text(arguments[0], part.strip(), where) for part in parts if part.strip()]
     if kind is bool:
         if text not in ("true", "false"):
             raise FieldError(f"{where}: expected true or false, found {text!r}")
@@ -110,18 +129,18 @@ def from_text(kind: object, text: str, where: str) -> Any:
         try:
             return kind(text)
         except ValueError:
-            raise FieldError(f"{where}: expected {kind_name(kind)}, found {text!r}") from None
+            raise FieldError(f"{where}: expected {_kind_name(kind)}, found {text!r}") from None
     if kind is str:
         return text
     raise FieldError(f"{where}: is a table; name one of its keys")
 
 
-def kind_name(kind: object) -> str:
-    """A type in words."""
+def _kind_name(kind: object) -> str:
+    """A type as an error names it."""
     names = {str: "a text", int: "a whole number", float: "a finite number", bool: "true or false"}
     if kind in names:
         return names[kind]
-    return " or ".join(kind_name(option) for option in typing.get_args(kind) if option is not type(None)) or str(kind)
+    return " or ".join(_kind_name(option) for option in typing.get_args(kind) if option is not type(None)) or str(kind)
 
 
 def plain(value: object) -> Any:

@@ -1,15 +1,13 @@
 """Calibration data: named, hashed walks of a robot through people; never random.
 
-A name is a set that ships in `export/calibration_sets/`, `folder:PATH` (a user's images in the order of their names) or
-`video:PATH`. What a user's pictures do not say (poses, velocities) is assumed, and `Clip.assumed` says so.
+A name is a set that ships in `calibration_sets/` here, `folder:PATH` (a user's images in the order of their names) or
+`video:PATH`. What a user's pictures do not record (poses, velocities) is assumed, and `Clip.assumed` names it.
 """
 
 from __future__ import annotations
 
 import hashlib
 import itertools
-import math
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,15 +18,11 @@ import numpy.typing as npt
 
 from edge.core.geometry import SE2
 from edge.reasoning.prompt import InstructionError, check_instruction
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from export.core.typed import FieldError, build, tomllib
 
 Picture = npt.NDArray[np.uint8]
 
-SETS = Path(__file__).parents[1] / "calibration_sets"
+SETS = Path(__file__).with_name("calibration_sets")
 CLIP_S = 20.0
 """Shortest clip: 9 s of the frames before an anchor, 10 s of growing delay after it, and 1 s to choose anchors in."""
 MAX_GAP_S = 1.5
@@ -89,11 +83,6 @@ class CalibrationSet:
     sha256: str
     clips: tuple[Clip, ...]
 
-    @property
-    def frames(self) -> int:
-        """Number of pictures."""
-        return sum(len(clip.frames) for clip in self.clips)
-
     def to_dict(self) -> dict[str, object]:
         """What the manifest keeps: name, hash, counts and what was assumed."""
         assumed = sorted({clip.assumed for clip in self.clips if clip.assumed})
@@ -101,9 +90,34 @@ class CalibrationSet:
             "name": self.name,
             "sha256": self.sha256,
             "clips": len(self.clips),
-            "frames": self.frames,
+            "frames": sum(len(clip.frames) for clip in self.clips),
             "assumed": "; ".join(assumed),
         }
+
+
+@dataclass(frozen=True)
+class _FrameRow:
+    file: str
+    stamp_s: float
+    pose: tuple[float, float, float]
+    velocity: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class _ClipRow:
+    name: str
+    instruction: str
+    frames: tuple[_FrameRow, ...]
+
+
+@dataclass(frozen=True)
+class _SetFile:
+    """set.toml of a calibration set."""
+
+    schema: int
+    name: str
+    description: str
+    clips: tuple[_ClipRow, ...]
 
 
 def list_calibration_sets() -> list[str]:
@@ -129,51 +143,30 @@ def read_set(directory: Path) -> CalibrationSet:
     where = f"calibration set {directory.name}"
     try:
         contents = {path.name: path.read_bytes() for path in sorted(directory.iterdir())}
-        content = tomllib.loads(contents["set.toml"].decode("utf-8"))
+        listing = build(_SetFile, tomllib.loads(contents["set.toml"].decode("utf-8")), where)
     except (OSError, KeyError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise CalibrationError(f"{where}: set.toml cannot be read ({error})") from error
-    _check_keys(content, {"schema", "name", "description", "clips"}, where)
-    if content["schema"] != 1 or content["name"] != directory.name or not isinstance(content["clips"], list):
+    except FieldError as error:
+        raise CalibrationError(str(error)) from error
+    if listing.schema != 1 or listing.name != directory.name or not listing.clips:
         raise CalibrationError(f"{where}: expected schema 1, the directory's name and a list of clips")
-    clips = tuple(_clip(item, contents, where) for item in content["clips"])
-    listed = {file["file"] for item in content["clips"] for file in item["frames"]}
-    if listed | {"set.toml"} != set(contents):
-        other = sorted(set(contents) - listed - {"set.toml"})
+    clips = []
+    for clip in listing.clips:
+        frames = []
+        for row in clip.frames:
+            if row.file not in contents:
+                raise CalibrationError(f"{where}: {row.file} is missing")
+            image = _decode(contents[row.file], f"{where}: {row.file}")
+            frames.append(Frame(round(row.stamp_s * 1e9), image, SE2(*row.pose), row.velocity))
+        clips.append(Clip(clip.name, clip.instruction, tuple(frames)))
+    other = sorted(set(contents) - {row.file for clip in listing.clips for row in clip.frames} - {"set.toml"})
+    if other:
         raise CalibrationError(f"{where}: holds files that set.toml does not list: {', '.join(other[:3])}")
-    if not clips:
-        raise CalibrationError(f"{where}: has no clips")
-    return CalibrationSet(directory.name, _hash(contents), clips)
-
-
-def _check_keys(content: object, keys: set[str], where: str) -> None:
-    found = set(content) if isinstance(content, dict) else set()
-    if found != keys:
-        raise CalibrationError(f"{where}: unknown keys {sorted(found - keys)}, missing keys {sorted(keys - found)}")
-
-
-def _clip(item: Any, contents: dict[str, bytes], where: str) -> Clip:
-    _check_keys(item, {"name", "instruction", "frames"}, where)
-    frames = []
-    if not isinstance(item["frames"], list):
-        raise CalibrationError(f"{where}: frames of a clip must be an array")
-    for row in item["frames"]:
-        _check_keys(row, {"file", "stamp_s", "pose", "velocity"}, where)
-        file, pose, velocity = row["file"], row["pose"], row["velocity"]
-        if file not in contents:
-            raise CalibrationError(f"{where}: {file} is missing")
-        if not isinstance(pose, list) or not isinstance(velocity, list):
-            raise CalibrationError(f"{where}: {file}: pose and velocity must be arrays")
-        numbers = [row["stamp_s"], *pose, *velocity]
-        finite = all(isinstance(v, int | float) and math.isfinite(v) for v in numbers)
-        if len(pose) != 3 or len(velocity) != 3 or not finite:
-            raise CalibrationError(f"{where}: {file}: stamp_s, pose and velocity must be finite: 1, 3 and 3 numbers")
-        vx, vy, wz = (float(v) for v in velocity)
-        image = _decode(contents[file], f"{where}: {file}")
-        frames.append(Frame(round(row["stamp_s"] * 1e9), image, SE2(*map(float, pose)), (vx, vy, wz)))
-    return Clip(str(item["name"]), str(item["instruction"]), tuple(frames))
+    return CalibrationSet(directory.name, _hash(contents), tuple(clips))
 
 
 def _hash(contents: dict[str, bytes]) -> str:
+    """Hash of files in the order of their names."""
     digest = hashlib.sha256()
     for name, data in sorted(contents.items()):
         digest.update(f"{name}\0{len(data)}\0".encode())

@@ -1,66 +1,49 @@
-"""The gate: a graph that is not the same model, by the target's own thresholds, does not leave the workshop."""
+"""The gate: a graph that is not the same model, by the target's own thresholds, is not exported.
+
+Graphs run from the verified bytes of a directory, on the provider that ships if it is here, against PyTorch in fp32.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 from typing import Any
 
-from export.evaluation.metrics import ParityResult
-from export.evaluation.task_error import TaskError, short
-from export.target.sections import GraphGate, TaskGate
+import numpy as np
+import numpy.typing as npt
+import onnx
+import onnxruntime as ort
+
+from edge.artifacts.manifest import Artifacts
+from edge.inference.graph import CPU_PROVIDER, DTYPES, Graph
+from edge.inference.language import LanguageModel
+from export.evaluation.parity import Arrays, ParityResult
+from export.evaluation.task_error import (
+    Act,
+    Context,
+    StageOutputs,
+    TaskResult,
+    TorchStages,
+    compare,
+    moment_contexts,
+    plan,
+    prompt_parts,
+)
+from export.evaluation.task_samples import SampleSet, is_large
+from export.graphs.action import guidance_input
+from export.graphs.writer import IR_VERSION, OPSET
+from export.model.config import TicVlaConfig
+from export.targets.sections import GraphGate, TaskGate
+
+Floats = npt.NDArray[np.float32]
 
 PASS, WARN, FAIL = "PASS", "WARN", "FAIL"
 
 
 class GateError(Exception):
-    """A graph that is not the same model; its text says which and by how much."""
-
-
-@dataclass(frozen=True)
-class TaskResult:
-    """What a graph's rounding does to the robot: the worst moment over all delays of the semantic state."""
-
-    waypoint_cm: float
-    heading_deg: float
-    speed_mps: float
-    turn_radps: float
-    relative: float | None
-    """Mean deviation as a share of how much the model's own plans vary; None when they do not vary."""
-    by_delay_cm: tuple[tuple[float, float], ...]
-    """(Δt in s, worst moment's waypoint deviation in cm) in order of Δt."""
-    token_agreement: float | None = None
-    """Mean share of the first greedy tokens before the first that differs; None for a graph that writes no text."""
-    kv_cosine: float = 1.0
-    """Of the semantic state to the exact one, lowest over the samples."""
-    semantic: float | None = None
-    """How far another semantic state moves the exact plans, as a share of how much they vary; None: they do not."""
-
-    @classmethod
-    def of(cls, error: TaskError) -> TaskResult:
-        """The gate's figures of a measured task error."""
-        return cls(
-            waypoint_cm=error.waypoint_cm,
-            heading_deg=error.heading_deg,
-            speed_mps=error.speed_mps,
-            turn_radps=error.turn_radps,
-            relative=error.relative if math.isfinite(error.relative) else None,
-            by_delay_cm=tuple((delay_s, errors.waypoint_mean_cm.max) for delay_s, errors in error.by_delay),
-            token_agreement=error.token_agreement,
-            kv_cosine=error.kv_cosine,
-            semantic=short(error.semantic_cm / error.spread_cm) if error.spread_cm > 0 else None,
-        )
-
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> TaskResult:
-        """Inverse of `to_dict`."""
-        pairs = tuple((float(delay_s), float(cm)) for delay_s, cm in content["by_delay_cm"])
-        return cls(**{**content, "by_delay_cm": pairs})
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain JSON form."""
-        return {**vars(self), "by_delay_cm": [list(pair) for pair in self.by_delay_cm]}
+    """A graph that is not the same model; its text names it and the numbers."""
 
 
 @dataclass(frozen=True)
@@ -84,8 +67,8 @@ class GateResult:
     def to_dict(self) -> dict[str, Any]:
         """The manifest's `parity` section."""
         return {
-            **self.parity.to_dict(),
-            "task": None if self.task is None else self.task.to_dict(),
+            **asdict(self.parity),
+            "task": None if self.task is None else asdict(self.task),
             "verdict": self.verdict.level,
             "reasons": list(self.verdict.reasons),
             "provider": self.provider,
@@ -144,12 +127,142 @@ def judge(
     return Verdict(WARN, tuple(warned)) if warned else Verdict(PASS)
 
 
-def worst(verdicts: Mapping[str, Verdict]) -> str:
-    """The worst of several graphs' verdicts; raises ValueError without any."""
-    return max((verdict.level for verdict in verdicts.values()), key=(PASS, WARN, FAIL).index)
-
-
 def require(graph: str, verdict: Verdict) -> None:
     """Raise GateError when a graph failed."""
     if verdict.level == FAIL:
         raise GateError(f"{graph}: not the same model: {'; '.join(verdict.reasons)}")
+
+
+NEW_TOKENS = 16
+"""Greedy tokens of every calibration prompt that are compared."""
+
+
+def threads_for(config: TicVlaConfig) -> int:
+    """Threads for everything that is measured on a model: always the same number, because another one may sum in
+    another order and report another last digit. A small model's kernels are too short for two."""
+    return 2 if is_large(config) else 1
+
+
+@lru_cache
+def provider_loads(provider: str) -> bool:
+    """Whether ONNX Runtime can open a graph on that provider here: one may be listed whose libraries are missing."""
+    if provider not in ort.get_available_providers():
+        return False
+    value = onnx.helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, [1])
+    result = onnx.helper.make_tensor_value_info("y", onnx.TensorProto.FLOAT, [1])
+    graph = onnx.helper.make_graph([onnx.helper.make_node("Add", ["x", "x"], ["y"])], "probe", [value], [result])
+    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", OPSET)])
+    model.ir_version = IR_VERSION
+    options = ort.SessionOptions()
+    options.log_severity_level = 4
+    try:
+        session = ort.InferenceSession(model.SerializeToString(), sess_options=options, providers=[provider])
+    except Exception:  # noqa: BLE001 - a provider fails in any way it likes; all that matters is that it does
+        return False
+    return bool(session.get_providers()[0] == provider)
+
+
+def gate_provider(shipping: str) -> str:
+    """The provider that the gate runs a graph on: the shipping one if it loads here, else the CPU's."""
+    return shipping if provider_loads(shipping) else CPU_PROVIDER
+
+
+class OpenGraph:
+    """A graph of the directory as the gate runs it: arrays by name, in and out in fp32 whatever it computes in."""
+
+    def __init__(self, artifacts: Artifacts, name: str, threads: int) -> None:
+        shipping = artifacts.graphs[name].session.provider
+        self.provider = gate_provider(shipping)
+        # With its own options on its own provider; the CPU's has none of the shipping one's.
+        self._graph = Graph(
+            artifacts, name, threads=threads, provider=None if self.provider == shipping else self.provider
+        )
+        self._dtypes = {tensor.name: DTYPES[tensor.dtype] for tensor in artifacts.graphs[name].inputs}
+
+    def __call__(self, feeds: Arrays) -> Arrays:
+        """Run once; raises edge.inference.graph.GraphError."""
+        typed = {name: np.asarray(feeds[name]).astype(dtype, copy=False) for name, dtype in self._dtypes.items()}
+        found = self._graph.run(typed)
+        return {
+            name: array.astype(np.float32) if array.dtype == np.float16 else array
+            for name, array in zip(self._graph.output_names, found, strict=True)
+        }
+
+
+class TaskCheck:
+    """What the robot does differently when one graph is the shipped one and the others are PyTorch's in fp32."""
+
+    def __init__(self, torch_stages: TorchStages, reference: StageOutputs, samples: SampleSet) -> None:
+        self._torch = torch_stages
+        self._reference = reference
+        self._samples = samples
+
+    def vision(self, graph: OpenGraph) -> TaskResult:
+        """Of the shipped encoder."""
+        visual = [graph({"frame": frame})["visual_tokens"] for frame in self._samples.frames]
+        kv = [self._torch.language(prompt_parts(s, visual), 0)[0] for s in self._samples.samples]
+        return self._compare(visual, kv, self._torch.context)
+
+    def language(self, artifacts: Artifacts, threads: int, provider: str | None) -> TaskResult:
+        """Of the shipped language model: one graph, or the pair as it runs together."""
+        model = LanguageModel(artifacts, threads=threads, provider=provider)
+        kv, texts = [], []
+        for sample in self._samples.samples:
+            segments = prompt_parts(sample, self._reference.visual)
+            found = model.generate(segments, max_new_tokens=NEW_TOKENS, cancelled=lambda: False)
+            kv.append(found.last_layer_kv[:, : found.prompt_tokens])
+            texts.append(found.token_ids)
+        return self._compare(self._reference.visual, kv, self._torch.context, texts=texts)
+
+    def context(self, graph: OpenGraph) -> TaskResult:
+        """Of the shipped semantic context."""
+        name = guidance_input(self._torch.model.config)[0]
+        return self._compare(
+            self._reference.visual, self._reference.kv, lambda guidance: _unpacked(graph({name: guidance}))
+        )
+
+    def action(self, graph: OpenGraph) -> TaskResult:
+        """Of the shipped action expert."""
+        return self._compare(self._reference.visual, self._reference.kv, self._torch.context, act=_shipped_act(graph))
+
+    def _compare(
+        self,
+        visual: Sequence[Floats],
+        kv: Sequence[Floats],
+        context: Callable[[Floats], Context],
+        *,
+        texts: Sequence[tuple[int, ...]] | None = None,
+        act: Act | None = None,
+    ) -> TaskResult:
+        trajectories = tuple(
+            plan(act or self._torch.act, s, visual, moment_contexts(context, s, x))
+            for s, x in zip(self._samples.samples, kv, strict=True)
+        )
+        # Graphs that write no text are not held to any.
+        reference = self._reference if texts is not None else replace(self._reference, token_ids=tuple(() for _ in kv))
+        found = StageOutputs(tuple(visual), tuple(kv), tuple(texts or reference.token_ids), trajectories, ())
+        return compare(reference, found, self._samples)
+
+
+def _unpacked(context: Arrays) -> tuple[Floats, Floats]:
+    """Keys and values [layers, 1, heads, T, d] of the graphs' layout (a tensor a layer, keys transposed)."""
+    layers = range(len(context) // 2)
+    keys = np.stack([context[f"context.{i}.key"].swapaxes(2, 3) for i in layers])
+    return np.ascontiguousarray(keys), np.stack([context[f"context.{i}.value"] for i in layers])
+
+
+def _shipped_act(graph: OpenGraph) -> Act:
+    """`TorchStages.act` through the shipped graph, whose context has the layout that it reads fastest."""
+
+    def act(visual_tokens: Floats, state: Floats, latency: Floats, keys: Floats, values: Floats) -> Floats:
+        feeds: Arrays = {
+            "visual_tokens": visual_tokens,
+            "state": state,
+            "latency": latency,
+            **{f"context.{i}.key": layer.swapaxes(2, 3) for i, layer in enumerate(keys)},
+            **{f"context.{i}.value": layer for i, layer in enumerate(values)},
+        }
+        result: Floats = graph(feeds)["trajectory"]
+        return result
+
+    return act

@@ -1,20 +1,115 @@
-"""Test inputs of every graph and what PyTorch makes of them: the reference that the gate compares with."""
+"""A graph against PyTorch: seeded test inputs, what PyTorch makes of them, and how far the graph's outputs are from it.
+
+Worst cosine, largest difference and agreement of the chosen token; references are kept as safetensors files.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from safetensors.numpy import load_file, save_file
 
-from export.evaluation.metrics import Sample
+from export.evaluation.task_error import StageOutputs, short
+from export.evaluation.task_error import cosine as cosine_of
 from export.graphs.action import context_shapes, guidance_input
 from export.graphs.language import ROLES, cache_names
 from export.model.config import TicVlaConfig
 from export.model.network import TicVla
 
-Arrays = dict[str, npt.NDArray[Any]]
+Array = npt.NDArray[Any]
+Arrays = dict[str, Array]
+RunGraph = Callable[[Arrays], Arrays]
+
+PRIMARY_OUTPUTS = ("visual_tokens", "logits", "last_layer_kv", "context.0.value", "trajectory")
+"""What must differ between two inputs; caches echo their input and would always differ."""
+
+
+class ParityError(Exception):
+    """Outputs that cannot be compared: another shape, or values that are not finite."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One test input of a graph and what PyTorch makes of it, both by tensor name."""
+
+    feeds: dict[str, Array]
+    expected: dict[str, Array]
+    """Outputs to compare; a graph may have more, which are then not judged."""
+
+
+@dataclass(frozen=True)
+class ParityResult:
+    """Worst case over all inputs and outputs of one graph."""
+
+    inputs: int
+    cosine: float
+    max_abs: float
+    min_difference: float
+    """Smallest largest difference between the outputs of two different inputs (negative control)."""
+    top1: float | None
+    """Share of positions at which the same token is most likely, 0 to 1; None for a graph without tokens."""
+
+
+def compare(graph: str, samples: Sequence[Sample], run: RunGraph) -> ParityResult:
+    """Run a graph over all samples and compare; raises ParityError, and ValueError for less than two samples."""
+    if len(samples) < 2:
+        raise ValueError(f"{graph}: {len(samples)} samples, expected two or more for the negative control")
+    cosine, max_abs, min_difference = 1.0, 0.0, np.inf
+    same, tokens = 0, 0
+    primary: list[list[Array]] = []
+    for sample in samples:
+        found = run(sample.feeds)
+        for name, expected in sample.expected.items():
+            actual = _comparable(graph, name, expected, found)
+            if not expected.size:
+                continue
+            if name == "next_token":
+                # An index has no cosine. Where there are logits, they are compared instead.
+                if "logits" not in sample.expected:
+                    same, tokens = same + int(np.sum(expected == actual)), tokens + expected.size
+                continue
+            if name == "logits":
+                agree = expected.argmax(axis=-1) == actual.argmax(axis=-1)
+                same, tokens = same + int(agree.sum()), tokens + agree.size
+            cosine = min(cosine, cosine_of(expected, actual))
+            max_abs = max(max_abs, float(np.max(np.abs(expected.astype(np.float64) - actual))))
+        chosen = [found[name] for name in PRIMARY_OUTPUTS if name in sample.expected]
+        min_difference = min([min_difference, *(_difference(chosen, other) for other in primary)])
+        primary.append(chosen)
+    return ParityResult(
+        inputs=len(samples),
+        cosine=round(cosine, 9),
+        max_abs=short(max_abs),
+        min_difference=short(float(min_difference)),
+        top1=round(same / tokens, 6) if tokens else None,
+    )
+
+
+def _comparable(graph: str, name: str, expected: Array, found: Arrays) -> Array:
+    if name not in found:
+        raise ParityError(f"{graph}: gives no {name!r}")
+    actual = found[name]
+    if actual.shape != expected.shape:
+        raise ParityError(f"{graph}: {name} is {list(actual.shape)}, PyTorch gives {list(expected.shape)}")
+    if not np.isfinite(actual).all():
+        raise ParityError(f"{graph}: {name} has values that are not finite")
+    return actual
+
+
+def _difference(a: Sequence[Array], b: Sequence[Array]) -> float:
+    """Largest difference where two runs overlap (their free axes may differ in length)."""
+    largest = 0.0
+    for x, y in zip(a, b, strict=True):
+        cut = tuple(slice(0, min(m, n)) for m, n in zip(x.shape, y.shape, strict=True))
+        if all(s.stop > 0 for s in cut):
+            largest = max(largest, float(np.max(np.abs(x[cut].astype(np.float64) - y[cut].astype(np.float64)))))
+    return largest
 
 
 def sample_inputs(config: TicVlaConfig, name: str, index: int) -> Arrays:
@@ -118,3 +213,47 @@ def _language_outputs(model: TicVla, name: str, feeds: Arrays) -> Arrays:
     outputs = {"last_layer_kv": last_layer_kv.numpy()}
     outputs |= {n: t.numpy() for n, t in zip(cache_names(layers, "present"), present, strict=True)}
     return {"next_token": next_token.numpy(), "logits": logits.numpy(), **outputs} if role.token else outputs
+
+
+def save_samples(samples: Sequence[Sample], path: Path) -> None:
+    """Write test inputs and expected outputs to one safetensors file."""
+    tensors = {
+        f"{index}/{kind}/{name}": np.ascontiguousarray(array)
+        for index, sample in enumerate(samples)
+        for kind, arrays in (("feed", sample.feeds), ("expected", sample.expected))
+        for name, array in arrays.items()
+    }
+    save_file(tensors, path)
+
+
+def load_samples(path: Path) -> list[Sample]:
+    """Inverse of `save_samples`."""
+    samples: dict[int, Sample] = {}
+    for key, array in load_file(path).items():
+        index, kind, name = key.split("/", 2)
+        sample = samples.setdefault(int(index), Sample({}, {}))
+        (sample.feeds if kind == "feed" else sample.expected)[name] = array
+    return [samples[index] for index in sorted(samples)]
+
+
+def save_outputs(outputs: StageOutputs, path: Path) -> None:
+    """Write the reference of the task error to one safetensors file."""
+    tensors = {
+        f"{kind}/{index}": np.ascontiguousarray(array)
+        for kind in ("visual", "kv", "trajectories", "swapped")
+        for index, array in enumerate(getattr(outputs, kind))
+    }
+    tensors |= {f"token_ids/{index}": np.array(ids, dtype=np.int64) for index, ids in enumerate(outputs.token_ids)}
+    save_file(tensors, path)
+
+
+def load_outputs(path: Path) -> StageOutputs:
+    """Inverse of `save_outputs`."""
+    tensors = load_file(path)
+
+    def of(kind: str) -> tuple[Any, ...]:
+        count = sum(key.startswith(f"{kind}/") for key in tensors)
+        return tuple(tensors[f"{kind}/{index}"] for index in range(count))
+
+    token_ids = tuple(tuple(int(token) for token in ids) for ids in of("token_ids"))
+    return StageOutputs(of("visual"), of("kv"), token_ids, of("trajectories"), of("swapped"))

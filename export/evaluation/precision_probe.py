@@ -20,16 +20,18 @@ from torch import Tensor, nn
 from edge.reasoning.prompt import Segment
 from export.evaluation.parity import sample_inputs
 from export.evaluation.task_error import (
+    TorchStages,
     compare_plans,
+    empty_past,
     moment_contexts,
     plan,
     prompt_parts,
+    prompt_tensors,
     relative_error,
     short,
     spread,
 )
 from export.evaluation.task_samples import SampleSet, is_large
-from export.evaluation.torch_stages import TorchStages, empty_past, prompt_tensors
 from export.graphs.build import linear_layers
 from export.model.network import TicVla
 from export.model.vision import fold_tokens
@@ -73,10 +75,10 @@ class Reference:
         self.visual = [self.stages.encode(frame) for frame in samples.frames]
         progress(f"sensitivity: fp32 language model, {len(samples.samples)} prompts")
         self.kv = [self.stages.language(self.prompt(i), 0)[0] for i in range(len(samples.samples))]
-        self.contexts = [
-            moment_contexts(self.stages.context, s, kv) for s, kv in zip(samples.samples, self.kv, strict=True)
-        ]
-        self.plans = [plan(self.stages, s, self.visual, c) for s, c in zip(samples.samples, self.contexts, strict=True)]
+        self.contexts, self.plans = [], []
+        for sample, kv in zip(samples.samples, self.kv, strict=True):
+            self.contexts.append(moment_contexts(self.stages.context, sample, kv))
+            self.plans.append(plan(self.stages.act, sample, self.visual, self.contexts[-1]))
         self.spread_cm, self.spread_deg = spread(np.concatenate(self.plans))
 
     def prompt(self, index: int) -> list[Segment]:
@@ -86,7 +88,7 @@ class Reference:
     def reading(self, plans: Sequence[Floats], output_error: float, top1: float | None = None) -> Reading:
         """Compare the plans of the first samples, or of all, with the fp32 model's."""
         errors = compare_plans(self.plans[: len(plans)], plans, self.samples)
-        waypoint, heading = errors["waypoint_mean_cm"], errors["heading_end_deg"]
+        waypoint, heading = errors["waypoint_cm"], errors["heading_deg"]
         shares = [
             float(values.mean()) / of if of > 0 else 0.0 if values.max() == 0 else float("inf")
             for values, of in ((waypoint, self.spread_cm), (heading, self.spread_deg))
@@ -149,7 +151,7 @@ class VisionProbe(Probe):
         plans = []
         for sample in r.samples.samples:
             kv = r.stages.language(prompt_parts(sample, visual), 0)[0]
-            plans.append(plan(r.stages, sample, visual, moment_contexts(r.stages.context, sample, kv)))
+            plans.append(plan(r.stages.act, sample, visual, moment_contexts(r.stages.context, sample, kv)))
         return r.reading(plans, max(map(relative_error, r.visual, visual)))
 
     def group(self, group: str, precision: str) -> Reading:
@@ -170,7 +172,7 @@ class VisionProbe(Probe):
         for i, (sample, context) in enumerate(zip(r.samples.samples, r.contexts, strict=True)):
             frame = self._scan_frames[i % len(self._scan_frames)]
             for tokens_of, into in ((visual, plans), (r.visual, exact)):
-                into.append(plan(r.stages, sample, dict.fromkeys(range(len(visual)), tokens_of[frame]), context))
+                into.append(plan(r.stages.act, sample, dict.fromkeys(range(len(visual)), tokens_of[frame]), context))
         errors = [relative_error(r.visual[frame], visual[frame]) for frame in self._scan_frames]
         # `reading` compares with the plans of the true frames; moving them by the difference keeps that reference.
         moved = [base + found - expected for base, found, expected in zip(r.plans, plans, exact, strict=True)]
@@ -305,7 +307,7 @@ class LanguageProbe(Probe):
                 whole = np.concatenate([run["head"], whole], axis=1)
             errors.append(relative_error(r.kv[index], whole))
             sample = r.samples.samples[index]
-            plans.append(plan(r.stages, sample, r.visual, moment_contexts(r.stages.context, sample, whole)))
+            plans.append(plan(r.stages.act, sample, r.visual, moment_contexts(r.stages.context, sample, whole)))
             if self._tokens:
                 same.append(float((self._choices(hidden, head_precision) == run["tokens"]).float().mean()))
         return r.reading(plans, max(calls_error, *errors), sum(same) / len(same) if same else None)
@@ -324,7 +326,7 @@ class ActionProbe(Probe):
             if self.graph == "semantic_context":
                 context = moment_contexts(stages.context, sample, kv)
                 errors += [max(map(relative_error, e, c)) for e, c in zip(exact, context, strict=True)]
-            plans.append(plan(stages, sample, r.visual, context))
+            plans.append(plan(stages.act, sample, r.visual, context))
         return r.reading(plans, max(errors or map(relative_error, r.plans, plans)))
 
 

@@ -1,4 +1,4 @@
-"""Chooses every graph's precision by what rounding does to the robot's plan, and says why in one sentence.
+"""Chooses every graph's precision by what rounding does to the robot's plan, with the reason in one sentence.
 
 From the smallest candidate up, the first whose task error stays within the limits is taken; its most sensitive groups
 of layers are raised to the next more exact candidate where that is enough. Nothing here is timed: the same inputs give
@@ -10,18 +10,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from torch import nn
 
 from export.evaluation.calibration import CalibrationSet
 from export.evaluation.precision_probe import Probe, Reading, Reference, probe
-from export.evaluation.task_samples import Runtime, SampleSet, is_large, samples_from
+from export.evaluation.task_error import short
+from export.evaluation.task_samples import SampleSet, is_large, samples_from
 from export.graphs.build import linear_layers
 from export.model.config import TicVlaConfig
 from export.model.network import TicVla
 from export.quantize.precision import Precision, bits, weight_bytes
 from export.quantize.rounding import Rounder
+from export.targets.sections import Measured
 
 SEARCH_DELAYS_S = (0.0, 3.0, 10.0)
 RELATIVE_LIMIT = 0.5
@@ -49,13 +51,8 @@ class Limits:
 
     def load(self, reading: Reading, *, trained: bool) -> float:
         """The largest of the reading's figures as a share of its limit; at most 1 is within the limits."""
-        shares = [
-            reading.waypoint_cm / self.waypoint_cm,
-            reading.heading_deg / self.heading_deg,
-            reading.speed_mps / self.speed_mps,
-            reading.turn_radps / self.turn_radps,
-            reading.relative / self.relative,
-        ]
+        names = ("waypoint_cm", "heading_deg", "speed_mps", "turn_radps", "relative")
+        shares: list[float] = [getattr(reading, name) / getattr(self, name) for name in names]
         if trained and self.top1 is not None and reading.top1 is not None:
             shares.append((1 - reading.top1) / max(1 - self.top1, 1e-9))
         if self.output_error is not None:
@@ -106,50 +103,23 @@ class Decision:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON form."""
-        return {
-            "graph": self.graph,
-            "precision": self.precision.to_dict(),
-            "reason": self.reason,
-            "within_limits": self.within_limits,
-            "weight_bytes": self.weight_bytes,
-            "dropped": [asdict(item) for item in self.dropped],
-            "table": [{**asdict(row), "raised": list(row.raised)} for row in self.table],
-        }
+        return {**asdict(self), "precision": self.precision.to_dict()}
 
 
-class MeasuredPoint(Protocol):
-    """A target's `[[measured]]` entry: either a time or a rate."""
-
-    @property
-    def graph(self) -> str: ...
-
-    @property
-    def precision(self) -> str: ...
-
-    @property
-    def ms(self) -> float | None: ...
-
-    @property
-    def tokens_per_s(self) -> float | None: ...
-
-
-def search_samples(calibration: CalibrationSet, config: TicVlaConfig, runtime: Runtime, tokenizer: bytes) -> SampleSet:
+def search_samples(
+    calibration: CalibrationSet, config: TicVlaConfig, frame_offsets_s: Sequence[float], tokenizer: bytes
+) -> SampleSet:
     """The samples of the search: one anchor a clip, or two in a single one, and three delays.
 
     A large model gets two clips and one frame a prompt.
     """
     per_clip = 1 if len(calibration.clips) > 1 else 2
-    if not is_large(config):
-        return samples_from(
-            calibration, config, runtime, tokenizer, delays_s=SEARCH_DELAYS_S, anchors_per_clip=per_clip
-        )
-    clips = CalibrationSet(calibration.name, calibration.sha256, calibration.clips[:2])
-    return samples_from(clips, config, _NewestFrame(), tokenizer, delays_s=SEARCH_DELAYS_S, anchors_per_clip=per_clip)
-
-
-@dataclass(frozen=True)
-class _NewestFrame:
-    frame_offsets_s: tuple[float, ...] = (0.0,)
+    if is_large(config):
+        calibration = CalibrationSet(calibration.name, calibration.sha256, calibration.clips[:2])
+        frame_offsets_s = (0.0,)
+    return samples_from(
+        calibration, config, frame_offsets_s, tokenizer, delays_s=SEARCH_DELAYS_S, anchors_per_clip=per_clip
+    )
 
 
 class Search:
@@ -162,7 +132,7 @@ class Search:
         self, model: TicVla, samples: SampleSet, *, trained: bool, progress: Callable[[str], None] = lambda _: None
     ) -> None:
         self._model = model
-        self._trained = trained
+        self.trained = trained
         self._progress = progress
         self._reference = Reference(model, samples, progress)
 
@@ -172,7 +142,7 @@ class Search:
         candidates: Sequence[str],
         limits: Limits,
         *,
-        measured: Sequence[MeasuredPoint] = (),
+        measured: Sequence[Measured] = (),
         speed_first: bool = False,
     ) -> Decision:
         """Decide for one graph; `candidates` run from the most exact to the smallest. See `drop_dominated`.
@@ -186,7 +156,7 @@ class Search:
         kept, dropped = drop_dominated(graph, candidates, sizes, measured, speed_first=speed_first)
         # The rounded weights of one graph at a time: kept for all, they would take as much memory as the model.
         found = probe(self._reference, graph, Rounder(), activations=True)
-        trial = _Trial(found, limits, self._trained, self._progress)
+        trial = _Trial(found, limits, self.trained, self._progress)
         precision, within = _smallest_within(trial, kept)
         reason = _reason(trial, self, graph, precision, kept, within)
         return Decision(
@@ -199,37 +169,27 @@ class Search:
             table=(*trial.wholes.values(), *trial.ranked),
         )
 
-    @property
-    def trained(self) -> bool:
-        """Whether the weights were trained."""
-        return self._trained
-
     def bytes_of(self, graph: str, precision: Precision) -> int:
         """Bytes of the graph's linear layers in a precision."""
         part: nn.Module = self._model.vision if graph == "vision_encoder" else self._model.action
         if graph.split(".")[0] == "language_model":
             part = self._model.language
-        return layer_bytes(part, linear_layers(self._model.config, graph), precision)
-
-
-def layer_bytes(part: nn.Module, layers: Sequence[str], precision: Precision) -> int:
-    """Bytes of the named layers' weights; a token table is stored in 8 bits where a precision says fewer."""
-    total = 0
-    for layer in layers:
-        weight = part.get_submodule(layer).weight
-        assert isinstance(weight, nn.Parameter)
-        of = precision.of(layer)
-        if isinstance(part.get_submodule(layer), nn.Embedding) and of not in ("fp32", "fp16"):
-            of = "int8"
-        total += weight_bytes(of, weight.shape[0], weight.numel() // weight.shape[0])
-    return total
+        total = 0
+        for layer in linear_layers(self._model.config, graph):
+            module, of = part.get_submodule(layer), precision.of(layer)
+            assert isinstance(module.weight, nn.Parameter)
+            if isinstance(module, nn.Embedding) and of not in ("fp32", "fp16"):
+                of = "int8"  # a token table is stored in 8 bits at least
+            rows = module.weight.shape[0]
+            total += weight_bytes(of, rows, module.weight.numel() // rows)
+        return total
 
 
 def drop_dominated(
     graph: str,
     candidates: Sequence[str],
     sizes_bytes: dict[str, int],
-    measured: Sequence[MeasuredPoint],
+    measured: Sequence[Measured],
     *,
     speed_first: bool = False,
 ) -> tuple[tuple[str, ...], tuple[Dropped, ...]]:
@@ -261,20 +221,17 @@ def drop_dominated(
     return tuple(kept), tuple(dropped)
 
 
-def _time(graph: str, precision: str, measured: Sequence[MeasuredPoint]) -> float | None:
+def _time(graph: str, precision: str, measured: Sequence[Measured]) -> float | None:
     """Best measured time in ms, of a call or of a token."""
     times: list[float] = []
     for point in measured:
         if point.graph == graph and point.precision == precision:
-            if point.ms is not None:
-                times += [point.ms] if point.ms or point.tokens_per_s else []
-            elif point.tokens_per_s:
-                times.append(1000 / point.tokens_per_s)
-    return min(times) if times else None
+            times.append(point.ms if point.ms is not None else 1000 / (point.tokens_per_s or math.nan))
+    return min(times, default=None)
 
 
 UNRANKED_BITS = 16
-"""Nobody needs to know which layer feels 16 bits most: a graph that keeps the limits in it is not searched."""
+"""A graph that keeps the limits in this many bits is not searched for its most sensitive layers."""
 
 
 class _Trial:
@@ -314,7 +271,7 @@ class _Trial:
         values: dict[str, Any] = {
             name: value if value is None or math.isfinite(value) else None for name, value in asdict(reading).items()
         }
-        return SensitivityRow(group, precision, raised, load=_short(load), **values)
+        return SensitivityRow(group, precision, raised, load=short(load) if math.isfinite(load) else None, **values)
 
 
 def _smallest_within(trial: _Trial, kept: Sequence[str]) -> tuple[Precision, bool]:
@@ -384,8 +341,7 @@ def _reason(trial: _Trial, search: Search, graph: str, precision: Precision, kep
     if precision.overrides:
         names, to = [pattern for pattern, _ in precision.overrides], precision.overrides[0][1]
         parts.append(f"{', '.join(names)} raised to {to}, the most sensitive of {len(trial.ranked)} groups of layers")
-    smaller = kept[kept.index(precision.default) + 1 :]
-    for candidate in smaller:
+    for candidate in kept[kept.index(precision.default) + 1 :]:
         row = trial.wholes[Precision(candidate)]
         load = "far" if row.load is None else f"{row.load:.2g} times"
         parts.append(f"{candidate} alone is {load} the limit")
@@ -399,7 +355,3 @@ def _reason(trial: _Trial, search: Search, graph: str, precision: Precision, kep
 
 def _mb(size_bytes: int) -> str:
     return f"{size_bytes / 1e6:.3g} MB"
-
-
-def _short(value: float) -> float | None:
-    return float(f"{value:.4g}") if math.isfinite(value) else None

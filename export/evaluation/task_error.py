@@ -8,41 +8,114 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
+import torch
+from torch import Tensor, nn
 
 from edge.core.geometry import SE2
 from edge.motion.controller import TARGET_TIME_S, arc_to
 from edge.reasoning.prompt import Segment
 from edge.state.semantic import waypoints_now
 from export.evaluation.task_samples import Sample, SampleSet
+from export.graphs.build import linear_layers
+from export.model.network import TicVla
+from export.quantize.precision import Precision
+from export.quantize.rounding import Rounder
 
 Floats = npt.NDArray[np.float32]
 Picture = npt.NDArray[np.uint8]
 Context: TypeAlias = tuple[Floats, Floats]
+Visual: TypeAlias = Sequence[Floats] | Mapping[int, Floats]
+"""Visual tokens by frame."""
+Act: TypeAlias = Callable[[Floats, Floats, Floats, Floats, Floats], Floats]
+"""`TorchStages.act`, or a graph in its place."""
 
 
 class TaskErrorError(ValueError):
     """Outputs that cannot be compared: not finite, or of another shape than the reference's."""
 
 
-class Stages(Protocol):
-    """The model in the calls that the runtime makes, whatever runs them."""
+def prompt_tensors(model: TicVla, prompt: Sequence[Segment]) -> tuple[Tensor, Tensor]:
+    """Ids [1, T] and visual tokens [F, N, D] of a whole prompt, for one call."""
+    ids = torch.tensor([[token for segment in prompt for token in segment.ids]])
+    frames = [torch.from_numpy(segment.tokens) for segment in prompt if segment.tokens is not None]
+    vision = model.config.vision
+    visual = torch.cat(frames) if frames else torch.zeros(1, vision.tokens, vision.token_dim)
+    return ids, visual
 
-    def encode(self, frame: Picture) -> Floats:
+
+def empty_past(model: TicVla) -> list[Tensor]:
+    """KV caches before the first token."""
+    c = model.config.language
+    return [torch.zeros(1, c.kv_heads, 0, c.head_dim) for _ in range(2 * c.layers)]
+
+
+class TorchStages:
+    """The torch model in the calls that the runtime makes; the graphs named in `precisions` are rounded."""
+
+    def __init__(
+        self,
+        model: TicVla,
+        precisions: Mapping[str, Precision] | None = None,
+        *,
+        rounder: Rounder | None = None,
+        activations: bool = True,
+    ) -> None:
+        self.model = model
+        self._precisions = dict(precisions or {})
+        self._rounder = rounder or Rounder()
+        self._activations = activations
+
+    def encode(self, frame: npt.NDArray[np.uint8]) -> Floats:
         """Frame [1, px, px, 3] → visual tokens [1, N, D]."""
+        with torch.no_grad(), self._graph("vision_encoder", self.model.vision):
+            return _array(self.model.vision(torch.from_numpy(frame)))
 
     def language(self, prompt: Sequence[Segment], new_tokens: int) -> tuple[Floats, tuple[int, ...]]:
-        """K‖V of the last layer for every prompt token [1, T, kv_dim], and the first `new_tokens` greedy tokens."""
+        """K‖V of the last layer for every prompt token [1, T, kv_dim], and the first `new_tokens` greedy tokens.
 
-    def context(self, guidance: Floats) -> Context:
+        The prompt goes through one call, which chunks would not change.
+        """
+        ids, visual = prompt_tensors(self.model, prompt)
+        language, end = self.model.language, self.model.config.language.im_end_id
+        with torch.no_grad(), self._graph("language_model", language):
+            if new_tokens == 0:
+                return _array(language.hidden_states(ids, visual, empty_past(self.model))[2]), ()
+            next_id, _, kv, *past = language(ids, visual, empty_past(self.model))
+            found: list[int] = []
+            while len(found) < new_tokens and int(next_id) != end:
+                found.append(int(next_id))
+                if len(found) < new_tokens:
+                    next_id, _, _, *past = language(next_id, visual[:1], past)
+        return _array(kv), tuple(found)
+
+    def context(self, guidance: Floats) -> tuple[Floats, Floats]:
         """K‖V or waypoints → keys and values of every cross-attention layer, [layers, 1, heads, T, d] each."""
+        with torch.no_grad(), self._graph("semantic_context", self.model.action):
+            keys, values = self.model.action.context(torch.from_numpy(guidance))
+        return _array(keys), _array(values)
 
     def act(self, visual_tokens: Floats, state: Floats, latency: Floats, keys: Floats, values: Floats) -> Floats:
         """Visual tokens, state [1, 3], latency [1, 4] and context → trajectory [1, steps, 3]."""
+        tensors = [torch.from_numpy(array) for array in (visual_tokens, state, latency, keys, values)]
+        with torch.no_grad(), self._graph("action_expert", self.model.action):
+            return _array(self.model.action(*tensors))
+
+    def _graph(self, name: str, part: nn.Module) -> AbstractContextManager[None]:
+        precision = self._precisions.get(name)
+        if precision is None:
+            return nullcontext()
+        layers = linear_layers(self.model.config, name)
+        return self._rounder.applied(part, precision, layers, activations=self._activations)
+
+
+def _array(tensor: Tensor) -> Floats:
+    return cast(Floats, np.ascontiguousarray(tensor.numpy()))
 
 
 @dataclass(frozen=True)
@@ -61,9 +134,9 @@ class StageOutputs:
 
 
 def run_stages(
-    stages: Stages, samples: SampleSet, *, new_tokens: int = 0, progress: Callable[[str], None] = lambda _: None
+    stages: TorchStages, samples: SampleSet, *, new_tokens: int = 0, progress: Callable[[str], None] = lambda _: None
 ) -> StageOutputs:
-    """Run a whole sample set; for the reference once, for a candidate through `task_error`."""
+    """Run a whole sample set."""
     visual = []
     for number, frame in enumerate(samples.frames):
         progress(f"frame {number + 1} of {len(samples.frames)}")
@@ -74,22 +147,20 @@ def run_stages(
         last_layer_kv, ids = stages.language(prompt_parts(sample, visual), new_tokens)
         kv.append(last_layer_kv)
         token_ids.append(ids)
-    contexts = [moment_contexts(stages.context, s, x) for s, x in zip(samples.samples, kv, strict=True)]
-    others = [*samples.samples[1:], samples.samples[0]]
-    swapped = [
-        moment_contexts(stages.context, replace(s, waypoints=other.waypoints), x)
-        for s, other, x in zip(samples.samples, others, kv[1:] + kv[:1], strict=True)
-    ]
-    return StageOutputs(
-        tuple(visual),
-        tuple(kv),
-        tuple(token_ids),
-        tuple(plan(stages, s, visual, c) for s, c in zip(samples.samples, contexts, strict=True)),
-        tuple(plan(stages, s, visual, c) for s, c in zip(samples.samples, swapped, strict=True)),
-    )
+
+    def plans(waypoints: Sequence[Sample], guidance: Sequence[Floats]) -> tuple[Floats, ...]:
+        found = []
+        for sample, other, x in zip(samples.samples, waypoints, guidance, strict=True):
+            contexts = moment_contexts(stages.context, replace(sample, waypoints=other.waypoints), x)
+            found.append(plan(stages.act, sample, visual, contexts))
+        return tuple(found)
+
+    own = plans(samples.samples, kv)
+    swapped = plans([*samples.samples[1:], samples.samples[0]], kv[1:] + kv[:1])
+    return StageOutputs(tuple(visual), tuple(kv), tuple(token_ids), own, swapped)
 
 
-def prompt_parts(sample: Sample, visual: Sequence[Floats] | Mapping[int, Floats]) -> list[Segment]:
+def prompt_parts(sample: Sample, visual: Visual) -> list[Segment]:
     """The sample's prompt with its frames' visual tokens."""
     return [Segment(part.ids, None if part.frame is None else visual[part.frame]) for part in sample.prompt]
 
@@ -101,15 +172,10 @@ def moment_contexts(context: Callable[[Floats], Context], sample: Sample, last_l
     return [context(waypoints_now(sample.waypoints, moment.offset)) for moment in sample.moments]
 
 
-def plan(
-    stages: Stages,
-    sample: Sample,
-    visual: Sequence[Floats] | Mapping[int, Floats],
-    contexts: Sequence[Context],
-) -> Floats:
+def plan(act: Act, sample: Sample, visual: Visual, contexts: Sequence[Context]) -> Floats:
     """Trajectories [moments, steps, 3] of a sample under the semantic context of every moment."""
     planned = [
-        stages.act(
+        act(
             visual[moment.frame],
             np.array([moment.state], dtype=np.float32),
             np.array([moment.latency], dtype=np.float32),
@@ -121,144 +187,57 @@ def plan(
 
 
 @dataclass(frozen=True)
-class Stat:
-    """Mean, 95th percentile (nearest rank) and maximum."""
+class TaskResult:
+    """What rounding does to the robot: the worst moment over all delays of the semantic state."""
 
-    mean: float
-    p95: float
-    max: float
+    waypoint_cm: float
+    """Mean deviation over the chunk."""
+    heading_deg: float
+    """At the end of the chunk."""
+    speed_mps: float
+    turn_radps: float
+    relative: float | None
+    """Mean deviation as a share of how much the model's own plans vary (waypoints or heading, the larger); None when
+    they do not vary."""
+    by_delay_cm: tuple[tuple[float, float], ...]
+    """(Δt in s, worst moment's waypoint deviation in cm) in order of Δt."""
+    token_agreement: float | None = None
+    """Mean share of the first greedy tokens before the first that differs; None for a graph that writes no text."""
+    kv_cosine: float = 1.0
+    """Of the semantic state to the exact one, lowest over the samples."""
+    semantic: float | None = None
+    """How far another semantic state moves the exact plans, as a share of how much they vary; None: they do not."""
 
     @classmethod
-    def of(cls, values: Sequence[float] | Floats) -> Stat:
-        """Of at least one value; four significant digits: more say nothing and differ between machines."""
-        array = np.asarray(values, dtype=np.float64)
-        p95 = np.percentile(array, 95, method="inverted_cdf")
-        return cls(short(array.mean()), short(p95), short(array.max()))
+    def from_dict(cls, content: Mapping[str, Any]) -> TaskResult:
+        """Inverse of `asdict`, also through JSON."""
+        pairs = tuple((float(delay_s), float(cm)) for delay_s, cm in content["by_delay_cm"])
+        return cls(**{**content, "by_delay_cm": pairs})
 
 
-@dataclass(frozen=True)
-class Errors:
-    """Differences to the reference over some moments."""
-
-    moments: int
-    waypoint_1s_cm: Stat
-    waypoint_end_cm: Stat
-    """At the end of the chunk (3 s)."""
-    waypoint_mean_cm: Stat
-    """Mean over the chunk's points."""
-    heading_1s_deg: Stat
-    heading_end_deg: Stat
-    speed_mps: Stat
-    turn_radps: Stat
-
-
-@dataclass(frozen=True)
-class TaskError:
-    """Task error of a candidate, over all moments and by delay of the semantic state."""
-
-    overall: Errors
-    by_delay: tuple[tuple[float, Errors], ...]
-    spread_cm: float
-    """How far the reference's own plans lie from their mean, RMS over moments and points of the chunk."""
-    spread_deg: float
-    semantic_cm: float
-    """How far the reference's plans move when they are given the semantic state of another sample."""
-    visual_cosine: float
-    """Lowest over the frames."""
-    kv_cosine: float
-    """Lowest over the samples."""
-    kv_error: float
-    """Largest ‖K‖V − reference‖ / ‖reference‖ over the samples."""
-    token_agreement: float | None
-    """Mean share of the first greedy tokens before the first that differs; None when no text was generated."""
-
-    @property
-    def waypoint_cm(self) -> float:
-        """The gate's figure: the worst moment's mean deviation over the chunk."""
-        return self.overall.waypoint_mean_cm.max
-
-    @property
-    def heading_deg(self) -> float:
-        """The gate's figure: the worst moment's heading error at the end of the chunk."""
-        return self.overall.heading_end_deg.max
-
-    @property
-    def speed_mps(self) -> float:
-        """The gate's figure: the worst moment's forward-speed error."""
-        return self.overall.speed_mps.max
-
-    @property
-    def turn_radps(self) -> float:
-        """The gate's figure: the worst moment's yaw-rate error."""
-        return self.overall.turn_radps.max
-
-    @property
-    def relative(self) -> float:
-        """Mean deviation as a share of the reference's own spread: the larger of waypoints and heading."""
-        shares = (
-            _share(self.overall.waypoint_mean_cm.mean, self.spread_cm),
-            _share(self.overall.heading_end_deg.mean, self.spread_deg),
-        )
-        return short(max(shares))
-
-    @property
-    def relative_semantic(self) -> float:
-        """Mean deviation as a share of what another semantic state would do: judges the language model alone."""
-        return short(_share(self.overall.waypoint_mean_cm.mean, self.semantic_cm))
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain JSON form with the gate's figures."""
-        return {
-            "waypoint_cm": self.waypoint_cm,
-            "heading_deg": self.heading_deg,
-            "speed_mps": self.speed_mps,
-            "turn_radps": self.turn_radps,
-            "relative": _finite(self.relative),
-            "relative_semantic": _finite(self.relative_semantic),
-            "spread_cm": self.spread_cm,
-            "spread_deg": self.spread_deg,
-            "semantic_cm": self.semantic_cm,
-            "visual_cosine": self.visual_cosine,
-            "kv_cosine": self.kv_cosine,
-            "kv_error": self.kv_error,
-            "token_agreement": self.token_agreement,
-            "overall": _plain(self.overall),
-            "by_delay_s": {f"{delay_s:g}": _plain(errors) for delay_s, errors in self.by_delay},
-        }
-
-
-def task_error(
-    reference: StageOutputs, candidate: Stages, samples: SampleSet, *, new_tokens: int = 0,
-    progress: Callable[[str], None] = lambda _: None,
-) -> TaskError:  # fmt: skip
-    """Run the candidate over the samples and compare with the reference's outputs; raises TaskErrorError."""
-    return compare(reference, run_stages(candidate, samples, new_tokens=new_tokens, progress=progress), samples)
-
-
-def compare(reference: StageOutputs, found: StageOutputs, samples: SampleSet) -> TaskError:
-    """Task error of outputs that are there already; raises TaskErrorError."""
+def compare(reference: StageOutputs, found: StageOutputs, samples: SampleSet) -> TaskResult:
+    """Task error of a candidate's outputs; raises TaskErrorError."""
     errors = compare_plans(reference.trajectories, found.trajectories, samples)
     agreement = [_agreement(a, b) for a, b in zip(reference.token_ids, found.token_ids, strict=True) if a]
-    delays = [moment.delay_s for sample in samples.samples for moment in sample.moments]
+    delays = np.array([moment.delay_s for sample in samples.samples for moment in sample.moments])
     everything = np.concatenate(reference.trajectories)
     swapped = np.concatenate(reference.swapped)
     spread_cm, spread_deg = spread(everything)
     moved = np.linalg.norm((swapped - everything)[..., :2].astype(np.float64), axis=-1)
-    return TaskError(
-        overall=_errors(errors, [True] * len(delays)),
-        by_delay=tuple((d, _errors(errors, [d == other for other in delays])) for d in sorted(set(delays))),
-        spread_cm=spread_cm,
-        spread_deg=spread_deg,
-        semantic_cm=short(100 * moved.mean()),
-        visual_cosine=short(min(map(cosine, reference.visual, found.visual)), digits=7),
-        kv_cosine=short(min(map(cosine, reference.kv, found.kv)), digits=7),
-        kv_error=short(max(map(relative_error, reference.kv, found.kv))),
+    means = {name: short(values.mean()) for name, values in errors.items()}
+    relative = short(max(_share(means["waypoint_cm"], spread_cm), _share(means["heading_deg"], spread_deg)))
+    return TaskResult(
+        **{name: short(values.max()) for name, values in errors.items()},
+        relative=relative if math.isfinite(relative) else None,
+        by_delay_cm=tuple((float(d), short(errors["waypoint_cm"][delays == d].max())) for d in sorted(set(delays))),
         token_agreement=short(sum(agreement) / len(agreement)) if agreement else None,
+        kv_cosine=short(min(map(cosine, reference.kv, found.kv)), digits=7),
+        semantic=short(short(100 * moved.mean()) / spread_cm) if spread_cm > 0 else None,
     )
 
 
 def compare_plans(reference: Sequence[Floats], found: Sequence[Floats], samples: SampleSet) -> dict[str, Floats]:
-    """Deviation of every moment by the names of `Errors`' figures; raises TaskErrorError."""
+    """Deviation of every moment by the names of `TaskResult`'s figures; raises TaskErrorError."""
     a, b = np.concatenate(list(reference)).astype(np.float64), np.concatenate(list(found)).astype(np.float64)
     if a.shape != b.shape:
         raise TaskErrorError(f"trajectories are {list(b.shape)}, the reference's {list(a.shape)}")
@@ -266,14 +245,11 @@ def compare_plans(reference: Sequence[Floats], found: Sequence[Floats], samples:
         raise TaskErrorError("a planned trajectory is not finite")
     one_second = min(a.shape[1], max(1, round(TARGET_TIME_S / samples.step_s))) - 1
     distance_cm = 100 * np.linalg.norm(a[..., :2] - b[..., :2], axis=-1)
-    turn_deg = np.degrees(np.abs((a[..., 2] - b[..., 2] + math.pi) % (2 * math.pi) - math.pi))
+    turn_deg = np.degrees(np.abs((a[:, -1, 2] - b[:, -1, 2] + math.pi) % (2 * math.pi) - math.pi))
     commands = np.abs(np.array([_command(row[one_second]) for row in a]) - [_command(row[one_second]) for row in b])
     return {
-        "waypoint_1s_cm": distance_cm[:, one_second],
-        "waypoint_end_cm": distance_cm[:, -1],
-        "waypoint_mean_cm": distance_cm.mean(axis=1),
-        "heading_1s_deg": turn_deg[:, one_second],
-        "heading_end_deg": turn_deg[:, -1],
+        "waypoint_cm": distance_cm.mean(axis=1),
+        "heading_deg": turn_deg,
         "speed_mps": commands[:, 0],
         "turn_radps": commands[:, 1],
     }
@@ -281,11 +257,6 @@ def compare_plans(reference: Sequence[Floats], found: Sequence[Floats], samples:
 
 def _command(point: npt.NDArray[np.float64]) -> tuple[float, float]:
     return arc_to(SE2(*(float(value) for value in point)), TARGET_TIME_S)
-
-
-def _errors(values: Mapping[str, Floats], chosen: Sequence[bool]) -> Errors:
-    mask = np.array(chosen)
-    return Errors(int(mask.sum()), **{name: Stat.of(array[mask]) for name, array in values.items()})
 
 
 def spread(trajectories: Floats) -> tuple[float, float]:
@@ -327,14 +298,5 @@ def _share(value: float, of: float) -> float:
 
 
 def short(value: float, digits: int = 4) -> float:
-    """The value with that many significant digits: more say nothing, and would differ between machines."""
+    """The value with that many significant digits: more are noise and would differ between machines."""
     return float(f"{float(value):.{digits}g}")
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def _plain(errors: Errors) -> dict[str, object]:
-    stats = {name: vars(value) for name, value in vars(errors).items() if isinstance(value, Stat)}
-    return {"moments": errors.moments, **{name: dict(stat) for name, stat in stats.items()}}

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -29,14 +28,6 @@ DELAYS_S = (0.0, 1.0, 2.0, 3.0, 5.0, 7.0, 10.0)
 LARGE_FRAME_MACS = 2e10
 """Multiply-adds of one encoder frame from which a model counts as large: one sample a clip then takes minutes."""
 FRAME_TOLERANCE_S = 0.6
-
-
-class Runtime(Protocol):
-    """The part of a target's runtime section that samples depend on."""
-
-    @property
-    def frame_offsets_s(self) -> tuple[float, ...]:
-        """Ages of a generation's frames relative to its newest."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +92,7 @@ def is_large(config: TicVlaConfig) -> bool:
 def samples_from(
     calibration: CalibrationSet,
     config: TicVlaConfig,
-    runtime: Runtime,
+    frame_offsets_s: Sequence[float],
     tokenizer: bytes,
     *,
     delays_s: Sequence[float] = DELAYS_S,
@@ -129,24 +120,29 @@ def samples_from(
 
     samples: list[Sample] = []
     for number, clip in enumerate(calibration.clips):
-        for anchor_s in _anchors(clip, max(runtime.frame_offsets_s), max(delays_s), count):
-            shown = sorted({_nearest(clip, anchor_s - offset_s) for offset_s in runtime.frame_offsets_s})
+        for anchor_s in _anchors(clip, max(frame_offsets_s), max(delays_s), count):
+            indices = sorted({_nearest(clip, anchor_s - offset_s) for offset_s in frame_offsets_s})
             encoded = [
                 EncodedFrame(clip.frames[i].stamp_ns, clip.frames[i].T_odom_base, np.zeros(1, np.float32))
-                for i in shown
+                for i in indices
             ]
             # The builder gives one segment a frame, then the tail: the frames' places follow from the order.
-            way = way_of((frame.stamp_ns, frame.T_odom_base) for frame in clip.frames[: shown[-1] + 1])
+            way = way_of((frame.stamp_ns, frame.T_odom_base) for frame in clip.frames[: indices[-1] + 1])
             segments = builder.build(encoded, clip.instruction, way)
-            places = [index_of(number, i) for i in shown]
+            places = [index_of(number, i) for i in indices]
             prompt = tuple(
                 PromptPart(segment.ids, places[i] if segment.tokens is not None else None)
                 for i, segment in enumerate(segments)
             )
-            moments = tuple(_moment(clip, anchor_s, delay_s, number, index_of) for delay_s in delays_s)
+            moments = []
+            for delay_s in delays_s:
+                i = _nearest(clip, anchor_s + delay_s)
+                offset = _offset(clip, anchor_s, delay_s)
+                moments.append(Moment(delay_s, index_of(number, i), clip.frames[i].velocity, offset))
             guided = config.action.semantic_interface == "waypoints"
-            waypoints = tuple(_ahead(clip, anchor_s, time_s) for time_s in WAYPOINT_TIMES_S) if guided else None
-            samples.append(Sample(f"{clip.name}@{anchor_s:g}s", prompt, moments, waypoints))
+            offsets = [_offset(clip, anchor_s, time_s) for time_s in WAYPOINT_TIMES_S] if guided else None
+            waypoints = None if offsets is None else tuple((offset.x_m, offset.y_m) for offset in offsets)
+            samples.append(Sample(f"{clip.name}@{anchor_s:g}s", prompt, tuple(moments), waypoints))
     if len(samples) < 2:
         raise CalibrationError(
             f"calibration set {calibration.name}: gives one sample, two samples are needed to compare"
@@ -172,9 +168,9 @@ def _anchors(clip: Clip, history_s: float, future_s: float, count: int) -> list[
     return [first_s + i * (last_s - first_s) / max(1, count - 1) for i in range(count)]
 
 
-def check_clips(calibration: CalibrationSet, runtime: Runtime) -> None:
+def check_clips(calibration: CalibrationSet, frame_offsets_s: Sequence[float]) -> None:
     """Raise CalibrationError if the clips are too short for a target's frames and every delay: before any work."""
-    history_s, future_s = max(runtime.frame_offsets_s), max(DELAYS_S)
+    history_s, future_s = max(frame_offsets_s), max(DELAYS_S)
     anchors = [anchor_s for clip in calibration.clips for anchor_s in _anchors(clip, history_s, future_s, 2)]
     if len(anchors) < 2:
         raise CalibrationError(
@@ -196,16 +192,6 @@ def _pose(clip: Clip, time_s: float) -> SE2:
     return interpolate(a.T_odom_base, b.T_odom_base, min(1.0, max(0.0, fraction)))
 
 
-def _ahead(clip: Clip, anchor_s: float, time_s: float) -> tuple[float, float]:
-    offset = _pose(clip, anchor_s).inverse() @ _pose(clip, anchor_s + time_s)
-    return offset.x_m, offset.y_m
-
-
-class _IndexOf(Protocol):
-    def __call__(self, clip: int, frame: int, /) -> int: ...
-
-
-def _moment(clip: Clip, anchor_s: float, delay_s: float, number: int, index_of: _IndexOf) -> Moment:
-    frame = _nearest(clip, anchor_s + delay_s)
-    offset = _pose(clip, anchor_s).inverse() @ _pose(clip, anchor_s + delay_s)
-    return Moment(delay_s, index_of(number, frame), clip.frames[frame].velocity, offset)
+def _offset(clip: Clip, anchor_s: float, time_s: float) -> SE2:
+    """Motion from the anchor to `time_s` after it, in the robot frame at the anchor."""
+    return _pose(clip, anchor_s).inverse() @ _pose(clip, anchor_s + time_s)

@@ -1,20 +1,26 @@
-"""The action expert's two graphs: what depends on the semantic state alone, and what changes every tick."""
+"""The action expert's two graphs: what depends on the semantic state alone, and what changes every tick.
+
+A head's loop is unrolled and its noise is stored: no loop and no chance is left in a graph.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
+import torch
 from onnx import TensorProto
+from torch import nn
 from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 
-from export.graphs.action_heads import denoised, flowed, in_metres
-from export.graphs.cross_attention import attend, key_values, mlp, query, query_weights, weights
-from export.graphs.vision import array, layer_norm, split_heads
+from export.graphs.vision import array, layer_norm, merge_heads, split_heads
 from export.graphs.writer import Array, GraphWriter
 from export.model.action import ActionExpert
 from export.model.attention import CrossAttentionLayer, KeyValue
 from export.model.config import TicVlaConfig
+from export.model.heads import MAX_LOG_SCALE, Coupling, Diffusion, Flow, ddim_steps, halved, weave
 from export.quantize.precision import Precision
 
 TOKENS = "T"
@@ -56,7 +62,6 @@ def write_context(action: ActionExpert, directory: Path, *, precision: Precision
         last = [table, g.op("Neg", [length]), g.constant([np.iinfo(np.int64).max]), g.constant([1])]
         x = g.op("Add", [x, g.op("Slice", last)])
         for i, pair in enumerate(action.key_values):
-            assert isinstance(pair, KeyValue)
             k = g.linear(x, f"key_values.{i}.k", array(pair.k.weight), array(pair.k.bias))
             v = g.linear(x, f"key_values.{i}.v", array(pair.v.weight), array(pair.v.bias))
             split_heads(g, k, c.heads, keys=True, out=f"context.{i}.key")
@@ -88,7 +93,8 @@ def write_action(action: ActionExpert, directory: Path, *, precision: Precision,
             x = g.linear(_features(g, action, now, split), "out", *weights(action.out))
             x = g.in_float32(x)
         if action.scale is not None:
-            x = in_metres(g, action.scale, x)
+            x = g.op("Mul", [x, g.constant(array(action.scale.std), "std")])
+            x = g.op("Add", [x, g.constant(array(action.scale.mean), "mean")])
         _trajectory(g, x, c.parameterisation)
         g.output("trajectory", TensorProto.FLOAT, (1, c.steps, 3))
         return g.finish()
@@ -98,7 +104,6 @@ def _features(g: GraphWriter, action: ActionExpert, now: str, split: str) -> str
     """What each step's query finds in the present and the semantic context, whose lengths `split` gives."""
     x: str | None = None
     for i, (pair, layer) in enumerate(zip(action.key_values, action.layers, strict=True)):
-        assert isinstance(pair, KeyValue) and isinstance(layer, CrossAttentionLayer)
         name = f"layers.{i}"
         key, value = key_values(g, now, f"key_values.{i}", pair)
         if x is None:
@@ -150,3 +155,139 @@ def _trajectory(g: GraphWriter, steps: str, parameterisation: str) -> None:
     position = g.op("Slice", [steps, g.constant([0]), g.constant([2]), g.constant([2])])
     heading = g.op("CumSum", [g.op("Slice", [steps, g.constant([2]), g.constant([3]), g.constant([2])]), axis])
     g.op("Concat", [position, heading], axis=2, out="trajectory")
+
+
+def denoised(g: GraphWriter, action: ActionExpert, diffusion: Diffusion, now: str, split: str) -> str:
+    """Tokens of the present → normalised actions [1, steps, 3] in fp32; `split`: lengths of present, context, chunk.
+
+    Keys and values of the present and of the semantic context are made once for all passes. Actions stay in fp32
+    between the layers: they are few, and each pass builds on the one before.
+    """
+    c = action.config.action
+    present = [key_values(g, now, f"key_values.{i}", pair) for i, pair in enumerate(action.key_values)]
+    x = g.constant(array(diffusion.noise), "noise")
+    for time, a, b in ddim_steps(c.diffusion_steps, c.ddim_steps):
+        clean = _clean(g, action, diffusion, x, time, present, split)
+        if a == 0 and b == 1:
+            x = clean
+            continue
+        kept = g.op("Mul", [x, g.constant(np.float32(a), "ddim")])
+        x = g.op("Add", [kept, g.op("Mul", [clean, g.constant(np.float32(b), "ddim")])])
+    return x
+
+
+def _clean(
+    g: GraphWriter,
+    action: ActionExpert,
+    diffusion: Diffusion,
+    noisy: str,
+    time: int,
+    present: list[tuple[str, str]],
+    split: str,
+) -> str:
+    """One pass of the denoiser."""
+    with torch.no_grad():
+        places = action.queries + diffusion.time_tokens(torch.tensor([time]))
+    x = g.linear(g.from_float32(noisy), "diffusion.action_in", *weights(diffusion.action_in))
+    x = g.op("Add", [x, g.floats(array(places), "places")])
+    for i, (pair, layer) in enumerate(zip(action.key_values, action.layers, strict=True)):
+        name = f"layers.{i}"
+        normed = layer_norm(g, x, layer.norm1, f"{name}.norm1")
+        own = key_values(g, normed, f"key_values.{i}", pair)
+        keys, values = (present[i][0], f"context.{i}.key", own[0]), (present[i][1], f"context.{i}.value", own[1])
+        x = attend(g, x, name, layer, query(g, normed, name, layer), keys, values, split)
+    x = mlp(g, layer_norm(g, x, action.norm, "norm"), "head", action.head)
+    return g.in_float32(g.linear(x, "out", *weights(action.out)))
+
+
+def flowed(g: GraphWriter, flow: Flow, features: str) -> str:
+    """Features [1, steps, hidden] → normalised actions [1, steps, 3] in fp32."""
+    steps = flow.noise.shape[1]
+    halves = [g.constant(array(half), "noise") for half in halved(flow.noise)]
+    end, axis, stride = (g.constant([value]) for value in (steps, 1, 2))
+    step_features = [g.op("Slice", [features, g.constant([start]), end, axis, stride]) for start in (0, 1)]
+    for i, coupling in enumerate(flow.couplings):
+        moved, given = i % 2, 1 - i % 2
+        name = f"flow.couplings.{i}"
+        log_scale, shift = _affine(g, name, coupling, halves[given], step_features[given], step_features[moved])
+        bounded = g.op("Tanh", [g.op("Mul", [log_scale, g.constant(np.float32(1 / MAX_LOG_SCALE), "bound")])])
+        scale = g.op("Exp", [g.op("Mul", [bounded, g.constant(np.float32(MAX_LOG_SCALE), "bound")])])
+        halves[moved] = g.op("Add", [g.op("Mul", [halves[moved], scale]), shift])
+    order = g.constant(np.array(weave(steps), np.int64), "order")
+    return g.op("Gather", [g.op("Concat", halves, axis=1), order], axis=1)
+
+
+def _affine(
+    g: GraphWriter, name: str, coupling: Coupling, given: str, given_features: str, features: str
+) -> tuple[str, str]:
+    """Logarithm of the scale before it is bounded, and shift, in fp32."""
+    layer = coupling.layer
+    own = g.linear(g.from_float32(given), f"{name}.action_in", *weights(coupling.action_in))
+    keys, values = key_values(g, g.op("Add", [given_features, own]), f"{name}.key_value", coupling.key_value)
+    normed = layer_norm(g, features, layer.norm1, f"{name}.layer.norm1")
+    q = query(g, normed, f"{name}.layer", layer)
+    x = attend(g, features, f"{name}.layer", layer, q, [keys], [values])
+    out = g.linear(layer_norm(g, x, coupling.norm, f"{name}.norm"), f"{name}.out", *weights(coupling.out))
+    parts = [g.unique("log_scale"), g.unique("shift")]
+    log_scale, shift = g.ops("Split", [g.in_float32(out), g.constant([3, 3])], parts, axis=2)
+    return log_scale, shift
+
+
+def weights(module: nn.Linear) -> tuple[Array, Array]:
+    """Weight [out, in] and bias [out]."""
+    return array(module.weight), array(module.bias)
+
+
+def mlp(g: GraphWriter, x: str, name: str, module: nn.Sequential) -> str:
+    """A `projection`."""
+    first, _, second = module
+    assert isinstance(first, nn.Linear) and isinstance(second, nn.Linear)
+    x = g.op("Gelu", [g.linear(x, f"{name}.0", *weights(first))])
+    return g.linear(x, f"{name}.2", *weights(second))
+
+
+def key_values(g: GraphWriter, tokens: str, name: str, pair: KeyValue) -> tuple[str, str]:
+    """Keys [1, heads, d, T], as their product reads them, and values [1, heads, T, d] of tokens [1, T, hidden]."""
+    k = g.linear(tokens, f"{name}.k", *weights(pair.k))
+    v = g.linear(tokens, f"{name}.v", *weights(pair.v))
+    return split_heads(g, k, pair.heads, keys=True), split_heads(g, v, pair.heads)
+
+
+def query_weights(layer: CrossAttentionLayer) -> tuple[Array, Array]:
+    """Weight and bias of the queries, the softmax's scale included."""
+    scale = np.float32((layer.q.out_features // layer.heads) ** -0.5)
+    weight, bias = weights(layer.q)
+    return weight * scale, bias * scale
+
+
+def query(g: GraphWriter, normed: str, name: str, layer: CrossAttentionLayer) -> str:
+    """Queries [1, heads, S, d] of normed tokens [1, S, hidden]."""
+    return split_heads(g, g.linear(normed, f"{name}.q", *query_weights(layer)), layer.heads)
+
+
+def attend(
+    g: GraphWriter,
+    x: str,
+    name: str,
+    layer: CrossAttentionLayer,
+    q: str,
+    keys: Sequence[str],
+    values: Sequence[str],
+    split: str | None = None,
+) -> str:
+    """Tokens [1, S, hidden] after a layer with queries `q` over sets of keys and values; `split`: the sets' lengths.
+
+    Nothing is concatenated along the tokens: scores against each set are joined before the softmax and parted again
+    after it. That is the same sum in another order, hence exact up to rounding.
+    """
+    scores = [g.op("MatMul", [q, k]) for k in keys]
+    if split is None:
+        shares = [g.op("Softmax", scores, axis=-1)]
+    else:
+        softmax = g.op("Softmax", [g.op("Concat", scores, axis=3)], axis=-1)
+        shares = g.ops("Split", [softmax, split], [g.unique("share") for _ in keys], axis=3)
+    parts = [g.op("MatMul", [share, v]) for share, v in zip(shares, values, strict=True)]
+    attended = merge_heads(g, reduce(lambda a, b: g.op("Add", [a, b]), parts))
+    x = g.op("Add", [x, g.linear(attended, f"{name}.o", *weights(layer.o))])
+    h = g.linear(layer_norm(g, x, layer.norm2, f"{name}.norm2"), f"{name}.fc1", *weights(layer.fc1))
+    return g.op("Add", [x, g.linear(g.op("Gelu", [h]), f"{name}.fc2", *weights(layer.fc2))])

@@ -17,22 +17,14 @@ from export.graphs.writer import Ranges
 from export.model.config import TicVlaConfig
 from export.model.network import TicVla
 from export.quantize.precision import Precision, bits
+from export.targets.file import OTHER_GRAPHS
+from export.targets.sections import FORMS
 
-FORMS = ("fused", "plain")
-"""`fused`: ONNX Runtime's own fused operators; `plain`: standard ONNX operators only (TensorRT, OpenVINO)."""
-LANGUAGE_WHOLE = ("language_model",)
-LANGUAGE_PAIR = ("language_model.prefill", "language_model.decode")
 WEIGHT_TYPES = frozenset(
     {TensorProto.FLOAT, TensorProto.FLOAT16, TensorProto.INT8, TensorProto.UINT8, TensorProto.INT4, TensorProto.UINT4}
 )
 SINGLE_FILE_BYTES = 64_000_000
 """A graph with more weights than this keeps them in a data file of their own, which is mapped and not read."""
-
-
-def graph_names(pair: bool) -> tuple[str, ...]:
-    """Names of a directory's graphs, with one language model or with a pair."""
-    language = LANGUAGE_PAIR if pair else LANGUAGE_WHOLE
-    return ("vision_encoder", *language, "semantic_context", "action_expert")
 
 
 def write_graph(
@@ -73,7 +65,7 @@ def write_graph(
         return write_context(model.action, directory, precision=precision, form=form, half=half)
     if name == "action_expert":
         return write_action(model.action, directory, precision=precision, form=form, half=half)
-    raise ValueError(f"graph {name!r} is not known; expected one of {(*graph_names(False), *LANGUAGE_PAIR)}")
+    raise ValueError(f"graph {name!r} is not known; expected one of {(*OTHER_GRAPHS, *ROLES)}")
 
 
 def _weight_bytes(module: nn.Module, precision: Precision) -> int:

@@ -15,9 +15,9 @@ from onnx import TensorProto
 from torch import nn
 
 from export.graphs.vision import array, fold_tokens, layer_norm
-from export.graphs.writer import Array, GraphWriter, most_exact
+from export.graphs.writer import Array, GraphWriter
 from export.model.language import DecoderLayer, LanguageModel
-from export.quantize.precision import Precision
+from export.quantize.precision import PRECISIONS, Precision
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,6 @@ def write_language(
         past = [g.input(n, g.float_type, shape) for n in cache_names(c.layers, "past_key_values")]
         delta: str | None = None
         for i, layer in enumerate(language.layers):
-            assert isinstance(layer, DecoderLayer)
             x, delta = _layer(g, layer, i, x, delta, past[2 * i], past[2 * i + 1], position)
         _last_layer_kv(g, c.layers - 1, position, c.kv_heads * c.head_dim)
         g.output("last_layer_kv", TensorProto.FLOAT, (1, "S", 2 * c.kv_heads * c.head_dim))
@@ -105,7 +104,6 @@ class _Position:
 def _embedding(g: GraphWriter, language: LanguageModel, ids: str) -> str:
     """Rows of the token table [1, S, hidden]; stored in 16 or 8 bits, computed in the graph's float type."""
     table, precision = array(language.embed.weight), g.precision.of("embed")
-    g.parameters += table.size
     if precision in ("fp32", "fp16"):
         stored = table.astype(np.float16 if precision == "fp16" else np.float32)
         rows = g.op("Gather", [g.shared_weight(stored, "embed.weight", EMBEDDING_FILE.format(precision)), ids])
@@ -174,7 +172,7 @@ def _layer(
     weight = np.concatenate([array(m.weight) for m in (layer.q, layer.k, layer.v)])
     bias = np.concatenate([array(m.bias) for m in (layer.q, layer.k, layer.v)])
     # One product for queries, keys and values, as exact as the most exact of the three.
-    exact = most_exact([g.precision.of(f"{name}.{part}") for part in "qkv"])
+    exact = min((g.precision.of(f"{name}.{part}") for part in "qkv"), key=PRECISIONS.index)
     qkv = g.linear(h, f"{name}.qkv", weight, bias, precision=exact)
     attended, _, _ = g.ops(
         "GroupQueryAttention",

@@ -42,7 +42,6 @@ def write_vision(
         x = g.op("Add", [x, g.weight(position[:, 1:].astype(g.float), "position")])
         x = g.op("Concat", [g.floats(first, "cls"), x], axis=1)
         for i, block in enumerate(vision.blocks):
-            assert isinstance(block, VisionBlock)
             x = _block(g, x, f"blocks.{i}", block, c.layer_norm_eps)
         x = g.op("Slice", [x, g.constant([1]), g.constant([1 + c.grid**2]), g.constant([1])])
         _projector(g, vision, x)
@@ -68,7 +67,7 @@ def _patches(g: GraphWriter, vision: VisionEncoder, frame: str) -> str:
 def _stem(g: GraphWriter, vision: VisionEncoder, frame: str) -> str:
     """Stride-2 convolutions; only the deviation folds into them, because their padding is at the mean colour."""
     c = vision.config
-    # As exact as the graph's default says, like the products: no override names a convolution.
+    # As exact as the graph's default, like the products: no override names a convolution.
     exact = g.precision.default == "fp32"
     kind = np.dtype(np.float32) if exact else g.float
     bits = "fp16" if g.precision.default == "fp16" or (g.half and not exact) else "fp32"
@@ -85,7 +84,6 @@ def _stem(g: GraphWriter, vision: VisionEncoder, frame: str) -> str:
             inputs += [g.constant(array(module.bias).astype(kind), f"embed.{i}.bias")]
             pad = module.kernel_size[0] // 2
             x = g.op("Conv", inputs, kernel_shape=list(module.kernel_size), strides=list(module.stride), pads=[pad] * 4)
-            g.parameters += weight.size + module.bias.numel()
         else:
             x = g.op("Gelu", [x])
     x = g.op("Reshape", [x, g.constant([1, c.hidden, c.grid**2])])
@@ -120,15 +118,8 @@ def _block(g: GraphWriter, x: str, name: str, block: VisionBlock, eps: float) ->
         rows = slice(part * hidden, (part + 1) * hidden)
         # The softmax's scale is part of the query's weights: exact for a power of two, and one pass less.
         factor = scale if part == 0 else np.float32(1)
-        parts.append(
-            g.linear(
-                h,
-                f"{name}.{'qkv'[part]}",
-                weight[rows] * factor,
-                bias[rows] * factor,
-                of=f"{name}.qkv",
-            )
-        )
+        part_name = f"{name}.{'qkv'[part]}"
+        parts.append(g.linear(h, part_name, weight[rows] * factor, bias[rows] * factor, of=f"{name}.qkv"))
     if g.fused:
         attended = g.op("MultiHeadAttention", parts, contrib=True, num_heads=heads, scale=1.0)
     else:

@@ -12,8 +12,8 @@ import numpy.typing as npt
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from export.quantize.precision import PRECISIONS, Precision, block_size
-from export.quantize.weights import quantise_blocks, quantise_channels
+from export.quantize.precision import Precision, block_size
+from export.quantize.rounding import quantise_blocks, quantise_channels
 
 Array = npt.NDArray[Any]
 Constant = Array | np.generic | Sequence[int] | Sequence[Sequence[int]] | int
@@ -65,7 +65,6 @@ class GraphWriter:
         self._inputs: list[onnx.ValueInfoProto] = []
         self._outputs: list[onnx.ValueInfoProto] = []
         self._shared: dict[tuple[str, tuple[int, ...], bytes], str] = {}
-        self.parameters = 0
 
     def __enter__(self) -> GraphWriter:
         return self
@@ -194,7 +193,6 @@ class GraphWriter:
         `of`: the network's layer that this is a part of, by whose name precision and range are looked up.
         """
         precision = precision or self.precision.of(of or layer)
-        self.parameters += weight.size + (0 if bias is None else bias.size)
         if block_size(precision) is not None:
             if not self.fused:
                 raise ValueError(f"{self.name}: {layer} in {precision}: blocks are an operator of the fused form only")
@@ -202,7 +200,12 @@ class GraphWriter:
         if precision == "int8" and not self.fused:
             return self._static_int8(x, layer, weight, bias, self._ranges.get(of or layer))
         if precision == "int8":
-            return self.from_float32(self._dynamic_int8(self.in_float32(x), layer, weight, bias))
+            q = quantise_channels(weight)
+            inputs = [self.in_float32(x), self.weight(q.values.T, f"{layer}.weight")]
+            inputs += [self.weight(q.scales, f"{layer}.scale")]
+            if bias is not None:
+                inputs += ["", self.weight(bias.astype(np.float32), f"{layer}.bias")]
+            return self.from_float32(self.op("DynamicQuantizeMatMul", inputs, contrib=True))
         if precision == "fp32":
             y = self.op("MatMul", [self.in_float32(x), self.stored(weight.T, f"{layer}.weight", precision)])
             if bias is not None:
@@ -228,13 +231,6 @@ class GraphWriter:
             return self.weight(value.astype(np.float32), name)
         half = self.weight(value.astype(np.float16), name)
         return half if self.half else self.cast(half, TensorProto.FLOAT)
-
-    def _dynamic_int8(self, x: str, layer: str, weight: Array, bias: Array | None) -> str:
-        q = quantise_channels(weight)
-        inputs = [x, self.weight(q.values.T, f"{layer}.weight"), self.weight(q.scales, f"{layer}.scale")]
-        if bias is not None:
-            inputs += ["", self.weight(bias.astype(np.float32), f"{layer}.bias")]
-        return self.op("DynamicQuantizeMatMul", inputs, contrib=True)
 
     def _static_int8(self, x: str, layer: str, weight: Array, bias: Array | None, largest: float | None) -> str:
         """Quantise-dequantise around a product, in the one form that compilers turn into 8-bit kernels.
@@ -297,8 +293,3 @@ class GraphWriter:
             self._data.flush()
         self._path.write_bytes(proto.SerializeToString(deterministic=True))
         return [path.name for path in (self._path, self._data_path, self._shared_path) if path is not None]
-
-
-def most_exact(precisions: Sequence[str]) -> str:
-    """The most exact of several layers' precisions: what they get when one product computes them all."""
-    return min(precisions, key=PRECISIONS.index)

@@ -19,10 +19,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 
-from export.model.attention import CrossAttentionLayer, KeyValue, projection
+from export.model.attention import CrossAttentionLayer, KeyValue, TypedModuleList, projection
 from export.model.config import TicVlaConfig
 from export.model.heads import ActionScale, Diffusion, Flow, differentiated, drawn, integrated, wrapped
-from export.model.module_list import TypedModuleList
 
 
 class TrunkLayers(Protocol):
@@ -113,7 +112,7 @@ class ActionExpert(nn.Module):
         """Last-layer K‖V [B, T, kv_dim], or waypoints [B, 3, 2] in m in the current robot frame → [B, T, hidden].
 
         States of different lengths are padded on the left: a token's place is counted from the end, where the answer's
-        last line, the waypoints, always stands. In training, `generator` (else torch's own) says what is dropped out.
+        last line, the waypoints, always stands. In training, `generator` (else torch's own) draws what is dropped out.
         """
         interface = self.config.action.semantic_interface
         if interface == "values-only":
@@ -196,27 +195,6 @@ class ActionExpert(nn.Module):
             clean = self.diffusion.sample(lambda noisy, times: self._denoised(noisy, times, trunk), trunk.batch)
             actions = self.scale(clean)
         return integrated(actions, self.config.action.parameterisation)
-
-    def loss(
-        self,
-        visual_tokens: Tensor,
-        state: Tensor,
-        latency: Tensor,
-        context_keys: Tensor,
-        context_values: Tensor,
-        target: Tensor,
-        mask: Tensor | None = None,
-        generator: torch.Generator | None = None,
-        *,
-        context_mask: Tensor | None = None,
-    ) -> Tensor:
-        """Mean of `errors` over the steps that `mask` [B, steps] does not leave out; inputs as of `forward`."""
-        now = self.now_tokens(visual_tokens, state, latency, generator)
-        errors = self.errors(self.trunk(now, context_keys, context_values, context_mask), target, generator)
-        if mask is None:
-            return errors.mean()
-        known = mask.to(errors.dtype)[..., None]
-        return (errors * known).sum() / (3 * known.sum()).clamp(min=1)
 
     def errors(self, trunk: TrunkLayers, target: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """What training makes small, number by number [B, steps, 3], for driven trajectories `target` [B, steps, 3].

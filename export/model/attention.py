@@ -1,9 +1,32 @@
-"""What the action expert is built of: projections into its latent space and cross-attention layers."""
+"""What the network is built of: typed module lists, projections into the latent space and cross-attention layers."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING, Generic, TypeVar, overload
+
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 - torch's own idiom
+
+M = TypeVar("M", bound=nn.Module)
+
+
+class TypedModuleList(nn.ModuleList, Generic[M]):
+    """`nn.ModuleList` that knows the type of its entries; at run time it is that list, parameter names included."""
+
+    if TYPE_CHECKING:
+
+        def __init__(self, modules: Iterable[M]) -> None: ...
+
+        def __iter__(self) -> Iterator[M]: ...
+
+        @overload
+        def __getitem__(self, index: slice) -> TypedModuleList[M]: ...
+
+        @overload
+        def __getitem__(self, index: int) -> M: ...
+
+        def __getitem__(self, index: int | slice) -> M | TypedModuleList[M]: ...
 
 
 def projection(inputs: int, hidden: int) -> nn.Sequential:

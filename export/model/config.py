@@ -1,12 +1,19 @@
-"""Every number of the TIC-VLA network in one frozen dataclass; presets `1b` (paper size) and `nano` (ours)."""
+"""Every number of the TIC-VLA network in one frozen dataclass; presets `1b` (paper size) and `nano` (ours).
+
+A network is named by a preset, a JSON file or `section.field=value` overrides.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from edge.state.reasoning_text import WAYPOINT_TIMES_S
+from export.core.typed import FieldError, SettingText, build, field_types, near
 
 SEMANTIC_INTERFACES = ("kv", "values-only", "waypoints")
 """What of a generation reaches the action expert: last-layer K‖V, V alone, or the points it wrote (paper Table 2)."""
@@ -15,6 +22,9 @@ HEADS = ("query", "diffusion", "flow")
 """How the actions are made (paper Table 11): read off the queries, denoised, or mapped from a Gaussian."""
 OF_HEADS = ("head", "diffusion_steps", "ddim_steps", "couplings")
 """Numbers of an action expert that came with the heads."""
+MODEL_PREFIX = "model."
+"""Of a `--set` that changes the network and not the target."""
+MAX_CONFIG_BYTES = 1 << 20
 
 
 class ModelConfigError(ValueError):
@@ -181,6 +191,7 @@ class TicVlaConfig:
     value: ValueConfig = field(default_factory=ValueConfig)
 
     def __post_init__(self) -> None:
+        _require(bool(self.name), "name is empty, expected a name for this network")
         side = self.vision.grid // self.vision.pixel_shuffle
         _require(
             side % self.language.token_merge == 0, f"{side} tokens a side do not merge by {self.language.token_merge}"
@@ -259,3 +270,58 @@ PRESETS = {
         value=ValueConfig(channels=128),
     ),
 }
+
+
+def config_for(model: str) -> TicVlaConfig:
+    """The configuration that `--model` names: a preset or a `.json` file; raises ModelConfigError."""
+    if model in PRESETS:
+        return PRESETS[model]
+    if model.endswith(".json"):
+        return config_from_file(Path(model))
+    raise ModelConfigError(
+        f"model {model!r} is not known; expected one of: {', '.join(sorted(PRESETS))}, or a .json file"
+    )
+
+
+def config_from_file(path: Path) -> TicVlaConfig:
+    """Read a TicVlaConfig in its `to_dict` form (absent fields keep their defaults); raises ModelConfigError."""
+    try:
+        if path.stat().st_size > MAX_CONFIG_BYTES:
+            raise ModelConfigError(f"{path}: {path.stat().st_size} bytes, expected a model configuration in JSON")
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ModelConfigError(f"{path}: cannot be read ({error.strerror})") from error
+    except ModelConfigError:
+        raise
+    except (ValueError, RecursionError) as error:
+        raise ModelConfigError(f"{path}: not JSON ({error})") from error
+    return config_from_dict(content, str(path))
+
+
+def config_from_dict(content: object, where: str = "model") -> TicVlaConfig:
+    """The inverse of `TicVlaConfig.to_dict`; raises ModelConfigError on unknown keys and values of another type."""
+    try:
+        return build(TicVlaConfig, content, where)
+    except FieldError as error:
+        raise ModelConfigError(str(error)) from error
+
+
+def model_settings(settings: Sequence[str]) -> dict[str, str]:
+    """Numbers of the network by `section.field`, from `--set model.section.field=value`; others are left out."""
+    pairs = [setting.partition("=") for setting in settings]
+    return {
+        key.strip().removeprefix(MODEL_PREFIX): value for key, _, value in pairs if key.strip().startswith(MODEL_PREFIX)
+    }
+
+
+def with_overrides(config: TicVlaConfig, overrides: Mapping[str, str]) -> TicVlaConfig:
+    """`config` with fields such as `action.layers` replaced by values written as text; raises ModelConfigError."""
+    content = config.to_dict()
+    sections = {key: kind for key, kind in field_types(TicVlaConfig).items() if key != "name"}
+    names = [f"{section}.{key}" for section, cls in sections.items() for key in field_types(cls)]
+    for key, text in overrides.items():
+        if key not in names:
+            raise ModelConfigError(f"model.{key} is not a number of the model; {near(key, names)}")
+        section, name = key.split(".")
+        content[section][name] = SettingText(text)
+    return config_from_dict(content)

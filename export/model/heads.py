@@ -1,17 +1,14 @@
 """The two other ways to make a chunk of actions that the paper compares (appendix D, Table 11): denoise it, or flow it.
 
-Both work on actions normalised by each step's own mean and deviation over the data set, which are stored with the
-weights. An *action* is what is integrated into the trajectory: an increment (dx m, dy m, dθ rad), or, of the
-parameterisation `offsets`, a position and an increment of the heading.
+Both work on actions normalised by each step's own mean and deviation over the data set, stored with the weights. An
+*action* is what is integrated into the trajectory: an increment (dx m, dy m, dθ rad), or, of the parameterisation
+`offsets`, a position and an increment of the heading.
 
-What they start from at inference, `noise`, is a buffer stored with the weights, where the paper draws anew: a plan is a
-function of its inputs, the same on every machine, and a graph is the same bytes when it is written again. Every tick
-takes the same point of the learned distribution: where two ways are as good, ticks do not alternate between them, and
-no chance is left in driving.
+What inference starts from, `noise`, is a buffer stored with the weights, where the paper draws anew: a plan is a
+function of its inputs, a graph is the same bytes when written again, and ticks do not alternate between two equal ways.
 
-* Diffusion: one Gaussian sample, drawn from the seed of the weights. Whatever is particular to it, every tick repeats;
-  but zero would be worse: the denoiser is trained on noise of its full length and never sees an input without any.
-* Flow: zero, the mode of the base, which the couplings map to the centre of what they learned: nothing to repeat.
+* Diffusion: one Gaussian sample of the weights' seed, since the denoiser never sees an input without noise.
+* Flow: zero, the mode of the base, which the couplings map to the centre of what they learned.
 """
 
 from __future__ import annotations
@@ -23,7 +20,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor, nn
 
-from export.model.attention import CrossAttentionLayer, KeyValue, projection
+from export.model.attention import CrossAttentionLayer, KeyValue, TypedModuleList, projection
 from export.model.config import ActionConfig
 
 MIN_STD = 1e-3
@@ -208,14 +205,14 @@ class Coupling(nn.Module):
 class Flow(nn.Module):
     """Normalising flow of couplings, which move even and odd steps in turn (even steps first and last of five).
 
-    Neighbouring steps say nearly everything about one another, which is what a coupling can use.
+    Neighbouring steps determine one another nearly completely, which a coupling can use.
     """
 
     noise: Tensor
 
     def __init__(self, config: ActionConfig) -> None:
         super().__init__()
-        self.couplings = nn.ModuleList(Coupling(config.hidden, config.heads) for _ in range(config.couplings))
+        self.couplings = TypedModuleList(Coupling(config.hidden, config.heads) for _ in range(config.couplings))
         self.register_buffer("noise", torch.zeros(1, config.steps, 3))
 
     def start(self) -> None:

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 
+from export.model.attention import TypedModuleList
 from export.model.config import LanguageConfig
-from export.model.module_list import TypedModuleList
 from export.model.vision import fold_tokens
 
 

@@ -3,22 +3,70 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any
+from math import isqrt, pi
+from typing import Any, Final
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from export.model.action import ActionExpert
+from export.model.attention import projection
 from export.model.config import TicVlaConfig
 from export.model.language import LanguageModel
-from export.model.places import RMS, grid_codes, line_codes
-from export.model.value import ValueNetwork
 from export.model.vision import VisionEncoder
 
 INIT_STD = 0.02
 HEAD_STD = 3e-4
+PLACE_RMS: Final = 0.5
+"""Of the numbers of a place's code; those of tokens are about 1.
+
+Places learned from nearly nothing were still nearly nothing after a thousand steps, beside tokens forty times as large.
+"""
+_SHORTEST: Final = 4.0  # wavelength, places
 PARTS = ("vision", "language", "action", "value")
+
+
+def line_codes(count: int, width: int) -> Tensor:
+    """Sines of every wavelength as codes of the places 0, 1, … on a line: [count, width] float32."""
+    pairs = (width + 1) // 2
+    lengths = _SHORTEST * float(count) ** (torch.arange(pairs) / max(pairs - 1, 1))
+    angle = 2 * pi * torch.arange(count)[:, None] / lengths
+    return (PLACE_RMS * 2**0.5 * torch.stack([angle.sin(), angle.cos()], dim=-1)).flatten(1)[:, :width]
+
+
+def grid_codes(count: int, width: int) -> Tensor:
+    """[count, width] float32: codes of a square's places, row by row; its rows in one half of the numbers.
+
+    Raises ValueError for a count that is no square.
+    """
+    side = isqrt(count)
+    if side * side != count:
+        raise ValueError(f"places: expected a square number of tokens, found {count}")
+    rows, columns = line_codes(side, width // 2), line_codes(side, width - width // 2)
+    return torch.cat([rows.repeat_interleave(side, 0), columns.repeat(side, 1)], dim=1)
+
+
+class ValueNetwork(nn.Module):
+    """Visual tokens [n, N, D], state [n, 3], relative goal [n, 2] → value [n] (paper Fig. 3b); never exported."""
+
+    def __init__(self, config: TicVlaConfig) -> None:
+        super().__init__()
+        width = config.value.channels
+        layers: list[nn.Module] = []
+        channels = config.vision.token_dim
+        for _ in range(config.value.conv_layers):
+            layers += [nn.Conv1d(channels, width, 3, stride=2, padding=1), nn.ReLU()]
+            channels = width
+        self.convolutions = nn.Sequential(*layers, nn.AdaptiveAvgPool1d(1), nn.Flatten())
+        self.low_dimensional = projection(5, width)
+        self.head = nn.Sequential(nn.Linear(2 * width, width), nn.ReLU(), nn.Linear(width, 1))
+
+    def forward(self, visual_tokens: Tensor, state: Tensor, goal: Tensor) -> Tensor:
+        seen = self.convolutions(visual_tokens.transpose(1, 2))
+        known = self.low_dimensional(torch.cat([state, goal], dim=-1))
+        values: Tensor = self.head(torch.cat([seen, known], dim=-1))
+        return values.squeeze(-1)
 
 
 class TicVla(nn.Module):
@@ -70,7 +118,7 @@ def initialise(model: TicVla, seed: int, parts: Sequence[str] = PARTS) -> None:
                 if module.bias is not None:
                     module.bias.zero_()
             elif isinstance(module, nn.Linear):
-                # What a head gives starts near zero; `ActionExpert.start` says around what.
+                # Outputs of a head start near zero; `ActionExpert.start` sets their centre.
                 ends = name.startswith("action.") and name.endswith(".out")
                 std = HEAD_STD if ends else max(INIT_STD, module.in_features**-0.5)
                 module.weight.normal_(0.0, std, generator=generator)
@@ -90,7 +138,7 @@ def initialise(model: TicVla, seed: int, parts: Sequence[str] = PARTS) -> None:
             visual += grid_codes(*visual.shape)
             semantic += line_codes(*semantic.shape).flip(0)  # place 0 is the last token
             # Two tokens among hundreds, state and latency: they are to be found before they are understood.
-            model.action.metadata_position.mul_(RMS / INIT_STD)
+            model.action.metadata_position.mul_(PLACE_RMS / INIT_STD)
             model.action.start(generator)
 
 

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 
+from export.model.attention import TypedModuleList
 from export.model.config import VisionConfig
-from export.model.module_list import TypedModuleList
 
 
 def pixel_shuffle_v2(x: Tensor, side: int) -> Tensor:

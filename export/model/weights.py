@@ -20,9 +20,13 @@ class WeightsError(ValueError):
     """A weights file that is not what its reader was asked for."""
 
 
+class CheckpointError(WeightsError):
+    """A checkpoint that is not the network asked for; its text is the one line to show."""
+
+
 @dataclass(frozen=True)
 class WeightsInfo:
-    """What a weights file says of itself."""
+    """Metadata of a weights file."""
 
     trained: bool
     origin: str

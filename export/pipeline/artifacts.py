@@ -8,31 +8,34 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from edge.artifacts.files import MANIFEST_NAME, SCHEMA_VERSION, ArtifactError, read_manifest, seal
 from edge.artifacts.manifest import load_artifacts
+from export.checkpoint.tokenizer import ID_FIELDS
 from export.core.cache import StageCache, file_sha256, fsync_path, package_versions
 from export.evaluation.gates import WARN, GateResult, require
 from export.graphs.build import graph_contract, graph_parameters
 from export.model.config import TicVlaConfig
 from export.pipeline.build import Pipeline
-from export.pipeline.job import Asked, Job
+from export.pipeline.job import Job
 from export.pipeline.report import report_html
-from export.pipeline.verify import first_difference
 from export.plan.plan import Plan, plan
-from export.target.file import Target
-from reporting.build_progress import Progress
+from export.targets.file import Target
+from reporting.progress import BuildProgress
 
 REPORT_JSON, REPORT_HTML, TOKENIZER_NAME = "report.json", "report.html", "tokenizer.json"
 NEW, OLD = "new", "old"
+RUNNER_KEYS = ("control_cores", "reasoning_cores", "control_priority", "decoding", "recovery")
+SHOWN_CHARACTERS = 60
 OLDER_SCHEMAS = (1, 2)
 """Schemas whose directories an export replaces."""
 
 
 def manifest_runtime(target: Target, config: TicVlaConfig, made: Plan) -> dict[str, object]:
-    """The manifest's `runtime` section; a plan that fits says how many tokens a generation may have."""
+    """The manifest's `runtime` section; a plan that fits limits the tokens of a generation."""
     language, policy = config.language, target.runtime
     planned = made.tokens if made.fits and made.tokens > 0 else policy.max_new_tokens
     return {
@@ -45,20 +48,12 @@ def manifest_runtime(target: Target, config: TicVlaConfig, made: Plan) -> dict[s
         "frame_offsets_s": list(policy.frame_offsets_s),
         "tick_period_ms": policy.tick_period_ms,
         "step_s": config.action.step_s,
-        "im_start_id": language.im_start_id,
-        "im_end_id": language.im_end_id,
-        "img_start_id": language.img_start_id,
-        "img_end_id": language.img_end_id,
-        "img_context_id": language.img_context_id,
-        "control_cores": list(policy.control_cores),
-        "reasoning_cores": list(policy.reasoning_cores),
-        "control_priority": policy.control_priority,
-        "decoding": policy.decoding,
-        "recovery": policy.recovery,
+        **{key: getattr(language, key) for key in ID_FIELDS},
+        **{key: getattr(policy, key) for key in RUNNER_KEYS},
     }
 
 
-def build_artifacts(job: Job, out: Path, cache: StageCache, progress: Progress) -> dict[str, Any]:
+def build_artifacts(job: Job, out: Path, cache: StageCache, progress: BuildProgress) -> dict[str, Any]:
     """Write `out` and return its report; raises GateError, ArtifactError, CheckpointError or OSError and then leaves
     nothing behind but finished stages in the cache."""
     check_replaceable(out)
@@ -116,7 +111,7 @@ def check_replaceable(out: Path) -> None:
 
 
 def _files_of(out: Path) -> dict[str, Any]:
-    """The files that a manifest lists, also one of an older schema if they are all there as it says."""
+    """The files that a manifest lists, also one of an older schema if all of them match it."""
     try:
         return dict(read_manifest(out)["files"])
     except ArtifactError:
@@ -145,7 +140,7 @@ def _swap(made: Path, out: Path, retired: Path) -> None:
     fsync_path(out.parent)
 
 
-def _write_directory(pipeline: Pipeline, directory: Path, progress: Progress) -> dict[str, Any]:
+def _write_directory(pipeline: Pipeline, directory: Path, progress: BuildProgress) -> dict[str, Any]:
     job = pipeline.job
     weights = pipeline.weights()
     (directory / TOKENIZER_NAME).write_bytes(pipeline.tokenizer())
@@ -174,7 +169,7 @@ def _write_directory(pipeline: Pipeline, directory: Path, progress: Progress) ->
             "weights_origin": weights.origin,
             "calibration": job.calibration.to_dict(),
             "packages": package_versions(),
-            "asked": asked_dict(job.asked),
+            "asked": asdict(job.asked),
             "target": job.target.to_dict(),
         },
     }
@@ -221,7 +216,7 @@ def _write_manifest(directory: Path, manifest: dict[str, Any]) -> None:
     _write_json(directory / MANIFEST_NAME, seal(manifest))
 
 
-def check_directory(pipeline: Pipeline, directory: Path, progress: Progress) -> dict[str, GateResult]:
+def check_directory(pipeline: Pipeline, directory: Path, progress: BuildProgress) -> dict[str, GateResult]:
     """The gate through the runner's own loader, on the bytes on disk; raises GateError at the first failure."""
     artifacts = load_artifacts(directory)
     results: dict[str, GateResult] = {}
@@ -233,7 +228,7 @@ def check_directory(pipeline: Pipeline, directory: Path, progress: Progress) -> 
     return results
 
 
-def verify_directory(job: Job, directory: Path, cache: StageCache, progress: Progress) -> dict[str, Any]:
+def verify_directory(job: Job, directory: Path, cache: StageCache, progress: BuildProgress) -> dict[str, Any]:
     """Hashes, contract and gates of an existing directory once more; raises ArtifactError or GateError."""
     manifest = read_manifest(directory)
     pipeline = Pipeline(job, cache, progress, run_gates=True)
@@ -246,11 +241,6 @@ def verify_directory(job: Job, directory: Path, cache: StageCache, progress: Pro
         pipeline.reference(name)
     results = check_directory(pipeline, directory, progress)
     return {**manifest, "graphs": {n: {**g, "parity": results[n].to_dict()} for n, g in manifest["graphs"].items()}}
-
-
-def asked_dict(asked: Asked) -> dict[str, object]:
-    """Plain JSON form."""
-    return {**vars(asked), "settings": list(asked.settings)}
 
 
 def _plan(pipeline: Pipeline) -> Plan:
@@ -282,8 +272,31 @@ def _check_manifest(pipeline: Pipeline, directory: Path, manifest: Mapping[str, 
         }
         found[f"graphs.{name}"] = {key: graphs[name].get(key) for key in ("precision", "form", "session")}
     for key, value in expected.items():
-        said = first_difference(found[key], json.loads(json.dumps(value)), key)
-        if said is not None:
-            raise ArtifactError(f"{directory / MANIFEST_NAME}: {said}; export again")
+        difference = _difference(found[key], json.loads(json.dumps(value)), key)
+        if difference is not None:
+            raise ArtifactError(f"{directory / MANIFEST_NAME}: {difference}; export again")
     if (directory / TOKENIZER_NAME).read_bytes() != pipeline.tokenizer():
         raise ArtifactError(f"{directory / TOKENIZER_NAME}: not the tokenizer that goes with the weights; export again")
+
+
+def _difference(found: object, expected: object, key: str) -> str | None:
+    """The first key at which two JSON values differ, with both, in words; None when they are the same."""
+    if isinstance(found, dict) and isinstance(expected, dict):
+        for name in [*expected, *(name for name in found if name not in expected)]:
+            below = f"{key}.{name}"
+            if name not in found:
+                return f"{below} is missing"
+            if name not in expected:
+                return f"{below} is of no export"
+            difference = _difference(found[name], expected[name], below)
+            if difference is not None:
+                return difference
+        # Of a precision's exceptions the first that matches wins.
+        return None if list(found) == list(expected) or not key.endswith("overrides") else f"{key} is in another order"
+    same = type(found) is type(expected) and found == expected
+    return None if same else f"{key} is {_shown(found)}, this export writes {_shown(expected)}"
+
+
+def _shown(value: object) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= SHOWN_CHARACTERS else f"{text[:SHOWN_CHARACTERS]}…"

@@ -18,42 +18,54 @@ import torch
 from edge.artifacts.manifest import LANGUAGE_PAIR, LANGUAGE_WHOLE, Artifacts
 from edge.inference.graph import GraphError
 from export.checkpoint.tokenizer import tokenizer_for
-from export.core.cache import ENTRY_NAME, StageCache, file_sha256, stage_key
-from export.evaluation.gate_run import NEW_TOKENS, OpenGraph, TaskCheck, gate_provider, threads_for
-from export.evaluation.gates import GateError, GateResult, TaskResult, judge
-from export.evaluation.metrics import ParityError, ParityResult, compare
-from export.evaluation.parity import references
+from export.core.cache import ENTRY_NAME, RESULT_NAME, StageCache, file_sha256, stage_key
+from export.evaluation.gates import (
+    NEW_TOKENS,
+    GateError,
+    GateResult,
+    OpenGraph,
+    TaskCheck,
+    gate_provider,
+    judge,
+    threads_for,
+)
+from export.evaluation.parity import (
+    ParityError,
+    ParityResult,
+    compare,
+    load_outputs,
+    load_samples,
+    references,
+    save_outputs,
+    save_samples,
+)
 from export.evaluation.precision_search import Limits, Search, search_samples
-from export.evaluation.sample_files import load_outputs, load_samples, save_outputs, save_samples
-from export.evaluation.task_error import StageOutputs, TaskErrorError, run_stages
+from export.evaluation.task_error import StageOutputs, TaskErrorError, TaskResult, TorchStages, run_stages
 from export.evaluation.task_samples import SampleSet, is_large, samples_from
-from export.evaluation.torch_stages import TorchStages
 from export.graphs.build import write_graph
 from export.model.weights import weights_sha256
 from export.pipeline.job import Job
 from export.quantize.precision import PRECISIONS, Precision
-from export.quantize.ranges import activation_ranges
-from reporting.build_progress import Progress, Stage
+from export.quantize.rounding import activation_ranges
+from reporting.progress import BuildProgress, Stage
 
 WEIGHTS_FILE = "weights.json"
 TOKENIZER_FILE = "tokenizer.json"
 SAMPLES_FILE = "samples.safetensors"
 OUTPUTS_FILE = "outputs.safetensors"
-DECISION_FILE = "decision.json"
-RANGES_FILE = "ranges.json"
 GATE_MARGIN = 0.7
 """Share of the gate's error that the search may use: it sees prompts, the gate the worst of its inputs."""
 RANGE_FRAMES = 8
 """Frames of the calibration set over which ranges of activations are taken, evenly spread."""
 
 WEIGHTS_CODE = ("export.pipeline.job", "export.checkpoint.load", "export.checkpoint.tokenizer", "export.model.weights")
-REFERENCE_CODE = ("export.evaluation.parity", "export.evaluation.sample_files")
-TASK_CODE = ("export.evaluation.task_samples", "export.evaluation.torch_stages", "export.evaluation.sample_files")
+REFERENCE_CODE = ("export.evaluation.parity",)
+TASK_CODE = ("export.evaluation.task_samples", "export.evaluation.task_error", "export.evaluation.parity")
 PRECISION_CODE = ("export.evaluation.precision_search",)
-RANGES_CODE = ("export.quantize.ranges",)
+RANGES_CODE = ("export.quantize.rounding",)
 GRAPH_CODE = ("export.graphs.build",)
-GATE_CODE = ("export.evaluation.gate_run", "export.evaluation.gates", "export.evaluation.sample_files")
-"""The modules that make each kind of stage; what they import counts too (`stages.source_sha256`)."""
+GATE_CODE = ("export.evaluation.gates", "export.evaluation.parity")
+"""The modules that make each kind of stage; what they import counts too (`cache.source_sha256`)."""
 
 EXPECTED_S = {
     "weights": (0.3, 30.0),
@@ -97,18 +109,16 @@ def machine_name() -> str:
 
 def build_stages(job: Job, known_s: Mapping[str, float], *, graphs: bool = True) -> list[Stage]:
     """All stages in their order (without those that write graphs), with the seconds they took last time or usually."""
-    column = int(is_large(job.config))
-    names = ["weights", "task reference"]
-    names += [f"reference {graph}" for graph in job.target.graph_names]
-    searched = [name for name, policy in job.target.graphs.items() if len(policy.candidates) > 1]
-    names += [f"precision {graph}" for graph in job.target.graph_names if graph in searched]
+    column, order = int(is_large(job.config)), job.target.graph_names
+    searched = [graph for graph in order if len(job.target.graphs[graph].candidates) > 1]
+    names = ["weights", "task reference", *(f"reference {graph}" for graph in order)]
+    names += [f"precision {graph}" for graph in searched]
     if graphs:
         vision = job.target.graphs["vision_encoder"]
         if vision.form == "plain" and "int8" in (vision.precision, *vision.candidates):
             names += ["activation ranges"]
-    names += [
-        f"{kind} {graph}" for kind in (("graph", "gate") if graphs else ("gate",)) for graph in job.target.graph_names
-    ]
+        names += [f"graph {graph}" for graph in order]
+    names += [f"gate {graph}" for graph in order]
     names += ["plan and report"] if graphs else []
     usual = {name: next(EXPECTED_S[kind][column] for kind in EXPECTED_S if name.startswith(kind)) for name in names}
     return [Stage(name, known_s.get(name, usual[name])) for name in names]
@@ -130,7 +140,7 @@ class Pipeline:
     With `run_gates`, gates run even where the same bytes have passed before: that is what `verify` is for.
     """
 
-    def __init__(self, job: Job, cache: StageCache, progress: Progress, *, run_gates: bool = False) -> None:
+    def __init__(self, job: Job, cache: StageCache, progress: BuildProgress, *, run_gates: bool = False) -> None:
         self.job = job
         self._run_gates = run_gates
         self._cache = cache
@@ -148,6 +158,15 @@ class Pipeline:
                 if cached:
                     watch.from_cache()
         return self._entries[key]
+
+    def _json_stage(self, title: str, key: str, compute: Callable[[], Mapping[str, object]]) -> dict[str, Any]:
+        """One stage whose result is plain JSON, in the order in which it was computed."""
+
+        def build(directory: Path) -> None:
+            (directory / RESULT_NAME).write_text(json.dumps(compute(), allow_nan=False), encoding="utf-8")
+
+        content: dict[str, Any] = json.loads((self._stage(title, key, build) / RESULT_NAME).read_text(encoding="utf-8"))
+        return content
 
     def _key(
         self, stage: str, parts: Mapping[str, object], modules: tuple[str, ...], recipe: Callable[..., Any]
@@ -168,12 +187,12 @@ class Pipeline:
     @cached_property
     def _weights_entry(self) -> Path:
         def build(directory: Path) -> None:
-            loaded = self.job.weights.get()
+            loaded = self.job.weights.loaded
             record = {
                 "sha256": weights_sha256(loaded.model),
                 "trained": loaded.info.trained,
                 "origin": loaded.info.origin,
-                "coverage": loaded.coverage.to_dict(),
+                "coverage": asdict(loaded.coverage),
             }
             (directory / WEIGHTS_FILE).write_text(json.dumps(record, sort_keys=True), encoding="utf-8")
             (directory / TOKENIZER_FILE).write_bytes(tokenizer_for(self.job.config, loaded.tokenizer))
@@ -195,7 +214,7 @@ class Pipeline:
         """Test inputs of a graph and PyTorch's outputs."""
 
         def build(directory: Path) -> None:
-            model = self.job.weights.get().model
+            model = self.job.weights.loaded.model
             save_samples(references(model, graph, self.job.target.gate(graph).inputs), directory / SAMPLES_FILE)
 
         return self._stage(f"reference {graph}", self._reference_key(graph), build) / SAMPLES_FILE
@@ -203,7 +222,8 @@ class Pipeline:
     @cached_property
     def samples(self) -> SampleSet:
         """Situations from the calibration set in which the robot is driven by an old semantic state."""
-        return samples_from(self.job.calibration, self.job.config, self.job.target.runtime, self.tokenizer())
+        offsets_s = self.job.target.runtime.frame_offsets_s
+        return samples_from(self.job.calibration, self.job.config, offsets_s, self.tokenizer())
 
     def _task_key(self) -> str:
         offsets = list(self.job.target.runtime.frame_offsets_s)
@@ -217,7 +237,7 @@ class Pipeline:
         """PyTorch's plans in those situations."""
 
         def build(directory: Path) -> None:
-            stages = TorchStages(self.job.weights.get().model)
+            stages = TorchStages(self.job.weights.loaded.model)
             outputs = run_stages(stages, self.samples, new_tokens=NEW_TOKENS, progress=self._progress.detail)
             save_outputs(outputs, directory / OUTPUTS_FILE)
 
@@ -263,19 +283,19 @@ class Pipeline:
             Pipeline.decision,
         )
 
-        def build(directory: Path) -> None:
+        def choose() -> dict[str, Any]:
             speed_first = graph in COMPUTING
-            decision = self._search.choose(graph, policy.candidates, limits, measured=points, speed_first=speed_first)
-            (directory / DECISION_FILE).write_text(json.dumps(decision.to_dict(), allow_nan=False), encoding="utf-8")
+            return self._search.choose(
+                graph, policy.candidates, limits, measured=points, speed_first=speed_first
+            ).to_dict()
 
-        entry = self._stage(f"precision {graph}", key, build)
-        content: dict[str, Any] = json.loads((entry / DECISION_FILE).read_text(encoding="utf-8"))
-        return content
+        return self._json_stage(f"precision {graph}", key, choose)
 
     @cached_property
     def _search(self) -> Search:
-        loaded = self.job.weights.get()
-        samples = search_samples(self.job.calibration, self.job.config, self.job.target.runtime, self.tokenizer())
+        loaded = self.job.weights.loaded
+        offsets_s = self.job.target.runtime.frame_offsets_s
+        samples = search_samples(self.job.calibration, self.job.config, offsets_s, self.tokenizer())
         return Search(loaded.model, samples, trained=loaded.info.trained, progress=self._progress.detail)
 
     def precision(self, graph: str) -> tuple[Precision, str]:
@@ -298,7 +318,7 @@ class Pipeline:
         key = self._key("graph", parts, GRAPH_CODE, Pipeline.graph)
 
         def build(directory: Path) -> None:
-            model = self.job.weights.get().model
+            model = self.job.weights.loaded.model
             write_graph(model, graph, precision, policy.form, directory, half=half, ranges=ranges)
 
         entry = self._stage(f"graph {graph}", key, build)
@@ -310,18 +330,12 @@ class Pipeline:
         if not rounds or "int8" not in (precision.default, *(kind for _, kind in precision.overrides)):
             return None
 
-        def build(directory: Path) -> None:
+        def ranges() -> dict[str, float]:
             frames = self.samples.frames[:: max(1, len(self.samples.frames) // RANGE_FRAMES)]
-            ranges = activation_ranges(self.job.weights.get().model.vision, frames)
-            (directory / RANGES_FILE).write_text(json.dumps(ranges, sort_keys=True, allow_nan=False), encoding="utf-8")
+            return activation_ranges(self.job.weights.loaded.model.vision, frames)
 
-        entry = self._stage(
-            "activation ranges",
-            self._key("ranges", {"task": self._task_key(), "frames": RANGE_FRAMES}, RANGES_CODE, build),
-            build,
-        )
-        content: dict[str, float] = json.loads((entry / RANGES_FILE).read_text(encoding="utf-8"))
-        return content
+        parts = {"task": self._task_key(), "frames": RANGE_FRAMES}
+        return self._json_stage("activation ranges", self._key("ranges", parts, RANGES_CODE, Pipeline._ranges), ranges)
 
     # ---- whether it is the same model
 
@@ -329,10 +343,14 @@ class Pipeline:
         """Run a graph of the directory against PyTorch and hold it to the target's thresholds; raises GateError."""
         contract, gate = artifacts.graphs[graph], self.job.target.gate(graph)
         provider = gate_provider(contract.session.provider)
+
+        def measure_parity() -> ParityResult:
+            return compare(graph, load_samples(self.reference(graph)), OpenGraph(artifacts, graph, self._threads))
+
         try:
             with self._progress.stage(f"gate {graph}") as watch:
                 measured, parity_cached = self._measured(
-                    "parity", artifacts, (graph,), self._reference_key(graph), lambda: self._parity(artifacts, graph)
+                    "parity", artifacts, (graph,), self._reference_key(graph), measure_parity
                 )
                 together = LANGUAGE_PAIR if graph in LANGUAGE_PAIR else (graph,)
                 moved, task_cached = self._measured(
@@ -354,37 +372,28 @@ class Pipeline:
         reference: str,
         measure: Callable[[], ParityResult | TaskResult],
     ) -> tuple[dict[str, Any], bool]:
-        key = self._gate_key(what, artifacts, graphs, reference)
+        files = [n for graph in graphs for n in (artifacts.graphs[graph].file, *artifacts.graphs[graph].data_files)]
+        parts = {
+            "files": {name: file_sha256(artifacts.directory / name) for name in files},
+            "sessions": [vars(artifacts.graphs[graph].session) for graph in graphs],
+            "providers": [gate_provider(artifacts.graphs[graph].session.provider) for graph in graphs],
+            "reference": reference,
+            "threads": self._threads,
+            "machine": machine_name(),
+        }
+        key = stage_key(what, parts, GATE_CODE)
         if not self._run_gates:
-            return self._cache.result(key, lambda: measure().to_dict())
+            return self._cache.result(key, lambda: asdict(measure()))
         if key not in self._fresh:  # once for both halves of a pair
-            self._fresh[key] = measure().to_dict()
+            self._fresh[key] = asdict(measure())
         return self._fresh[key], False
 
-    def _gate_key(self, what: str, artifacts: Artifacts, graphs: tuple[str, ...], reference: str) -> str:
-        files = [n for graph in graphs for n in (artifacts.graphs[graph].file, *artifacts.graphs[graph].data_files)]
-        return stage_key(
-            what,
-            {
-                "files": {name: file_sha256(artifacts.directory / name) for name in files},
-                "sessions": [vars(artifacts.graphs[graph].session) for graph in graphs],
-                "providers": [gate_provider(artifacts.graphs[graph].session.provider) for graph in graphs],
-                "reference": reference,
-                "threads": self._threads,
-                "machine": machine_name(),
-            },
-            GATE_CODE,
-        )
-
-    def _parity(self, artifacts: Artifacts, graph: str) -> ParityResult:
-        return compare(graph, load_samples(self.reference(graph)), OpenGraph(artifacts, graph, self._threads))
-
     def _task(self, artifacts: Artifacts, graph: str) -> TaskResult:
-        check = TaskCheck(TorchStages(self.job.weights.get().model), self._task_outputs, self.samples)
+        check = TaskCheck(TorchStages(self.job.weights.loaded.model), self._task_outputs, self.samples)
         if graph in (*LANGUAGE_WHOLE, *LANGUAGE_PAIR):
             shipping = artifacts.graphs[graph].session.provider
             provider = gate_provider(shipping)
-            return TaskResult.of(check.language(artifacts, self._threads, None if provider == shipping else provider))
+            return check.language(artifacts, self._threads, None if provider == shipping else provider)
         opened = OpenGraph(artifacts, graph, self._threads)
         run = {"vision_encoder": check.vision, "semantic_context": check.context, "action_expert": check.action}
-        return TaskResult.of(run[graph](opened))
+        return run[graph](opened)

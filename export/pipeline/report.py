@@ -7,7 +7,7 @@ from typing import Any
 
 from edge.artifacts.manifest import LANGUAGE_PAIR, LANGUAGE_WHOLE
 from export.pipeline.report_plots import Dot, Line, dot_plot, line_plot
-from reporting.page import document, table, text_html, tiles
+from reporting.page import Cell, Figure, Table, render
 
 Report = Mapping[str, Any]
 
@@ -18,37 +18,53 @@ MARKS = {"PASS": "pass", "WARN": "warn", "FAIL": "fail"}
 
 def report_html(report: Report) -> str:
     """The whole page; same report → same bytes."""
-    order = [name for name in GRAPH_ORDER if name in report["graphs"]]
-    report = {**report, "graphs": {name: report["graphs"][name] for name in order}}
-    target = report["provenance"]["target"]
-    title = f"{report['model']['name']} for {report['target']}"
-    parts = [
-        f"<h1>{text_html(title)}</h1>",
-        _headline_verdict(report),
-        f'<p class="quiet">{text_html(target["description"])}. Weights: '
-        f"{text_html(report['provenance']['weights_origin'])}.</p>",
-        _untrained_notice(report),
-        _unchecked_notice(report),
-        tiles(_headline(report)),
-        "<h2>Graphs</h2>",
-        _graph_table(report),
-        "<h2>Is it the same model?</h2>",
-        '<p class="quiet">Every graph ran in ONNX Runtime from the very bytes in this directory and is compared with '
-        "PyTorch in fp32. “Between inputs” is the control: the smallest difference between the outputs of two "
-        "different inputs, so that a graph that ignores its input cannot pass.</p>",
-        _gate_table(report),
-        _warnings(report),
-        "<h2>Why these precisions</h2>",
-        _reasons(report),
-        _sensitivity(report),
-        "<h2>Plan</h2>",
-        _plan(report["plan"]),
-        "<h2>Calibration</h2>",
-        _calibration(report["provenance"]["calibration"]),
-        "<h2>Provenance</h2>",
-        _provenance(report),
+    graphs = {name: report["graphs"][name] for name in GRAPH_ORDER if name in report["graphs"]}
+    report = {**report, "graphs": graphs}
+    provenance, plan = report["provenance"], report["plan"]
+    name = f"{report['model']['name']} for {report['target']}"
+    warnings = [
+        (graph_name, "; ".join(graph["parity"]["reasons"]))
+        for graph_name, graph in graphs.items()
+        if graph["parity"]["verdict"] == "WARN"
     ]
-    return document(f"edge-export: {title}", "\n".join(part for part in parts if part))
+    unchecked = [key for key, graph in graphs.items() if not graph["parity"]["shipping_provider_checked"]]
+    return render(
+        "export",
+        title=f"edge-export: {name}",
+        name=name,
+        verdict=f"{len(graphs)} graphs pass, {len(warnings)} with a warning"
+        if warnings
+        else f"all {len(graphs)} graphs pass",
+        description=provenance["target"]["description"],
+        provenance=provenance,
+        trained=report["model"]["trained"],
+        unchecked=", ".join(unchecked),
+        providers=" and ".join(sorted({graphs[key]["session"]["provider"] for key in unchecked})),
+        tiles=[
+            (size_text(sum(graph["bytes"] for graph in graphs.values())), "all graphs"),
+            (f"{sum(graph['params'] for graph in graphs.values()) / 1e6:,.0f} M", "parameters"),
+            *_plan_headline(plan),
+        ],
+        graphs=_graph_table(report),
+        gates=_gate_table(report),
+        limits=_gate(report, "task"),
+        warnings=warnings,
+        precisions=[(_precision(key, graph), graph["precision_reason"]) for key, graph in graphs.items()],
+        plots=[*_delay_plot(report), *_layer_plots(report)],
+        plan=plan,
+        schedule=_schedule(plan),
+        stages=_stages(plan),
+        calibration=provenance["calibration"],
+        facts=Table(
+            ("what", "value"),
+            [
+                ("weights", provenance["weights_origin"]),
+                ("weights sha256", Cell(provenance["weights_sha256"], "code")),
+                ("target", report["target"]),
+                ("packages", ", ".join(f"{key} {version}" for key, version in provenance["packages"].items())),
+            ],
+        ),
+    )
 
 
 def size_text(count: float) -> str:
@@ -66,129 +82,57 @@ def precision_text(precision: Mapping[str, Any]) -> str:
     return f"{precision['default']}{extra}"
 
 
-def _headline_verdict(report: Report) -> str:
-    levels = [graph["parity"]["verdict"] for graph in report["graphs"].values()]
-    warned = levels.count("WARN")
-    words = f"all {len(levels)} graphs pass" if not warned else f"{len(levels)} graphs pass, {warned} with a warning"
-    return f'<p><span class="verdict good">{words}</span></p>'
+def _precision(name: str, graph: Mapping[str, Any]) -> str:
+    precision = graph["precision"]
+    exceptions = ", ".join(f"{pattern} {kind}" for pattern, kind in precision["overrides"].items())
+    return f"{name}: {precision['default']}{f', but {exceptions}' if exceptions else ''}"
 
 
-def _untrained_notice(report: Report) -> str:
-    if report["model"]["trained"]:
-        return ""
-    return (
-        '<p class="notice"><b>The weights are untrained</b> (initial weights): a robot with them moves, it does not '
-        "navigate. Sizes and times are those of a trained model; what rounding does to one has to be measured anew.</p>"
-    )
-
-
-def _unchecked_notice(report: Report) -> str:
-    unchecked = [name for name, graph in report["graphs"].items() if not graph["parity"]["shipping_provider_checked"]]
-    if not unchecked:
-        return ""
-    providers = sorted({report["graphs"][name]["session"]["provider"] for name in unchecked})
-    return (
-        f'<p class="notice"><b>The device still has to repeat this check.</b> These graphs are made for '
-        f"{text_html(' and '.join(providers))}, which this machine does not have; the exact bytes were run on "
-        f"the CPU instead: {text_html(', '.join(unchecked))}. On the device: <code>edge-export verify DIR</code>.</p>"
-    )
-
-
-def _headline(report: Report) -> list[tuple[str, str]]:
-    graphs, plan = report["graphs"].values(), report["plan"]
-    return [
-        (size_text(sum(graph["bytes"] for graph in graphs)), "all graphs"),
-        (f"{sum(graph['params'] for graph in graphs) / 1e6:,.0f} M", "parameters"),
-        *_plan_headline(plan),
-    ]
-
-
-def _graph_table(report: Report) -> str:
+def _graph_table(report: Report) -> Table:
     rows = []
     for name, graph in report["graphs"].items():
         session = graph["session"]
         threads = "" if session["threads"] is None else f", threads: {session['threads']}"
         rows.append(
             (
-                text_html(name),
+                name,
                 size_text(graph["bytes"]),
                 f"{graph['params'] / 1e6:,.1f} M",
-                text_html(precision_text(graph["precision"])),
-                text_html(session["provider"].removesuffix("ExecutionProvider") + threads),
+                precision_text(graph["precision"]),
+                session["provider"].removesuffix("ExecutionProvider") + threads,
                 *_graph_time(report["plan"], name),
             )
         )
     head = ("graph", "size", "parameters", "precision", "runs on", "time", "tag")
-    return table(head, rows, numeric=frozenset({1, 2, 5}))
+    return Table(head, rows, numeric=frozenset({1, 2, 5}))
 
 
-def _gate_table(report: Report) -> str:
+def _gate_table(report: Report) -> Table:
     rows = []
     for name, graph in report["graphs"].items():
         parity, gate = graph["parity"], _gate(report, name)
-        task = parity["task"]
+        task, top1 = parity["task"], parity["top1"]
+        least_top1 = "" if gate.get("top1") is None else f"≥ {100 * gate['top1']:g} %"
         rows.append(
             (
-                text_html(name),
-                _mark(parity["verdict"]),
-                _held(f"{parity['cosine']:.6f}", f"≥ {gate['min_cosine']:g}"),
-                _held(f"{parity['max_abs']:.2g}", f"≤ {gate['max_abs']:g}"),
-                _held(f"{parity['min_difference']:.2g}", f"≥ {gate['min_difference']:g}"),
-                "–" if parity["top1"] is None else _held(f"{100 * parity['top1']:.1f} %", _share(gate["top1"])),
+                name,
+                Cell(parity["verdict"], MARKS[parity["verdict"]]),
+                Cell(f"{parity['cosine']:.6f}", note=f"≥ {gate['min_cosine']:g}"),
+                Cell(f"{parity['max_abs']:.2g}", note=f"≤ {gate['max_abs']:g}"),
+                Cell(f"{parity['min_difference']:.2g}", note=f"≥ {gate['min_difference']:g}"),
+                "–" if top1 is None else Cell(f"{100 * top1:.1f} %", note=least_top1),
                 "–" if task is None or task["token_agreement"] is None else f"{100 * task['token_agreement']:.0f} %",
                 "–" if task is None else f"{_small(task['waypoint_cm'])} cm",
                 "–" if task is None else f"{_small(task['heading_deg'])}°",
-                text_html(parity["provider"].removesuffix("ExecutionProvider")),
+                parity["provider"].removesuffix("ExecutionProvider"),
             )
         )
     numbers = ("cosine", "max-abs", "between inputs", "same token", "same text", "waypoint", "heading")
-    limits = _gate(report, "task")
-    return table(("graph", "", *numbers, "ran on"), rows, numeric=frozenset(range(2, 9))) + (
-        '<p class="quiet">Under a value: the threshold it is held to. Same text: mean share of the first greedy tokens '
-        "after every calibration prompt before the first that differs; only trained weights are held to it. What "
-        "rounding may do to the robot, worst case "
-        f"over the delays of the semantic state: waypoints {limits['waypoint_cm']:g} cm, heading "
-        f"{limits['heading_deg']:g}°, speed {limits['speed_mps']:g} m/s, turn rate {limits['turn_radps']:g} rad/s; on "
-        f"average no more than {limits['relative']:g} of how much the model's own plans vary; "
-        f"semantic state of cosine ≥ {limits['kv_cosine']:g}."
-        "</p>"
-    )
-
-
-def _mark(verdict: str) -> str:
-    return f'<span class="{MARKS[verdict]}">{verdict}</span>'
+    return Table(("graph", "", *numbers, "ran on"), rows, numeric=frozenset(range(2, 9)))
 
 
 def _small(value: float) -> str:
-    return "&lt; 0.01" if value < 0.01 else f"{value:.2f}"
-
-
-def _held(value: str, limit: str) -> str:
-    return f'{value}<br><span class="quiet">{text_html(limit)}</span>'
-
-
-def _share(limit: float | None) -> str:
-    return "" if limit is None else f"≥ {100 * limit:g} %"
-
-
-def _warnings(report: Report) -> str:
-    lines = [
-        f"<b>{text_html(name)}</b>: {text_html('; '.join(graph['parity']['reasons']))}"
-        for name, graph in report["graphs"].items()
-        if graph["parity"]["verdict"] == "WARN"
-    ]
-    return "" if not lines else f'<p class="notice">Near a limit: {"<br>".join(lines)}</p>'
-
-
-def _reasons(report: Report) -> str:
-    lines = []
-    for name, graph in report["graphs"].items():
-        precision = graph["precision"]
-        exceptions = ", ".join(f"{pattern} {kind}" for pattern, kind in precision["overrides"].items())
-        but = f", but {exceptions}" if exceptions else ""
-        chosen = text_html(f"{name}: {precision['default']}{but}")
-        lines.append(f"<p><b>{chosen}</b><br>{text_html(graph['precision_reason'], limit=2000)}</p>")
-    return "".join(lines)
+    return "< 0.01" if value < 0.01 else f"{value:.2f}"
 
 
 def _gate(report: Report, name: str) -> Mapping[str, Any]:
@@ -198,8 +142,8 @@ def _gate(report: Report, name: str) -> Mapping[str, Any]:
     return found
 
 
-def _sensitivity(report: Report) -> str:
-    """Task error over the age of the semantic state, and (where a search was made) over groups of layers."""
+def _delay_plot(report: Report) -> list[Figure]:
+    """Task error over the age of the semantic state, of the graphs for which it was measured."""
     lines = [
         Line(
             f"{name} ({precision_text(graph['precision'])})", tuple(map(tuple, graph["parity"]["task"]["by_delay_cm"]))
@@ -207,20 +151,20 @@ def _sensitivity(report: Report) -> str:
         for name, graph in report["graphs"].items()
         if graph["parity"]["task"] is not None
     ]
-    limit = _gate(report, "task")["waypoint_cm"]
-    plots = [
-        (
-            line_plot(lines, "age of the semantic state, Δt in s", "worst waypoint error in cm", limit),
+    if not any(line.points for line in lines):
+        return []
+    x_label, y_label = "age of the semantic state, Δt in s", "worst waypoint error in cm"
+    return [
+        Figure(
+            line_plot(lines, x_label, y_label, _gate(report, "task")["waypoint_cm"]),
+            f"{y_label} over {x_label}",
             "What rounding one graph does to the planned path, the others exact: the worst moment's mean deviation "
             "over the chunk, by how old the semantic state is. Measured on this directory's bytes.",
-        ),
-        *((plot, caption) for plot, caption in _layer_plots(report)),
+        )
     ]
-    figures = "".join(f"<figure>{plot}<figcaption>{text_html(c)}</figcaption></figure>" for plot, c in plots if plot)
-    return f'<div class="pair">{figures}</div>' if figures else ""
 
 
-def _layer_plots(report: Report) -> list[tuple[str, str]]:
+def _layer_plots(report: Report) -> list[Figure]:
     """For every graph that was searched: its most sensitive groups of layers, each rounded alone."""
     plots = []
     for name, decision in report["sensitivity"].items():
@@ -232,8 +176,9 @@ def _layer_plots(report: Report) -> list[tuple[str, str]]:
         more = f" of {len(rows)}" if len(rows) > LAYERS_SHOWN else ""
         kept = ", filled: kept more exact" if raised else ""
         plots.append(
-            (
+            Figure(
                 dot_plot(dots, "worst waypoint error in cm", _gate(report, "task")["waypoint_cm"]),
+                f"worst waypoint error in cm: {len(dots)} rows",
                 f"{name}: the {len(dots)}{more} most sensitive groups of layers, each rounded alone to "
                 f"{rows[0]['precision']}{kept}. Measured on the PyTorch model.",
             )
@@ -276,11 +221,9 @@ def _graph_time(plan: Mapping[str, Any], graph: str) -> tuple[str, str]:
     return " + ".join(f"{stage['ms']:,.3g} ms" for stage in stages), ", ".join(tags)
 
 
-def _plan(plan: Mapping[str, Any]) -> str:
-    verdict = "" if plan["fits"] else f'<p class="notice"><b>Does not fit:</b> {_joined(plan["reasons"])}</p>'
-    warned = f'<p class="notice">{_joined(plan["warnings"])}</p>' if plan["warnings"] else ""
+def _schedule(plan: Mapping[str, Any]) -> Table:
     rows = [
-        (text_html(what), _number(plan[key], unit) + _error(plan.get(ERRORS.get(key, ""))))
+        (what, f"{plan[key]:,.4g} {unit}".strip() + _error(plan.get(ERRORS.get(key, ""))))
         for key, what, unit in PLAN_ROWS
         if plan[key] is not None
     ]
@@ -289,57 +232,26 @@ def _plan(plan: Mapping[str, Any]) -> str:
         f"{name} {size_text(memory[name])}" for name in ("weights", "caches", "activations", "workspace")
     )
     rows.append((f"memory: {parts}", f"{size_text(plan['memory_bytes'])} of {size_text(memory['available'])}"))
-    stages = [
+    return Table(("schedule", "value"), rows, numeric=frozenset({1}))
+
+
+def _stages(plan: Mapping[str, Any]) -> Table:
+    rows = [
         (
-            text_html(name),
+            name,
             f"{stage['calls']:,}",
             f"{stage['ms']:,.3g} ms" + _error(stage["error"]),
             f"{stage['gflop']:,.3g}",
             size_text(stage["moved_bytes"]),
-            text_html(stage["bound"]),
+            stage["bound"],
             stage["tagged"],
-            text_html(stage["source"]),
+            stage["source"],
         )
         for name, stage in plan["per_graph"].items()
     ]
     head = ("stage", "calls", "time", "GFLOP", "bytes moved", "bound by", "tag", "source")
-    return (
-        f'{verdict}{warned}<p class="quiet">Power mode {text_html(plan["mode"])}. Sized from '
-        f"{text_html(plan['tagged'])} times; ± is the error bar where the model states one.</p>"
-        + table(("schedule", "value"), rows, numeric=frozenset({1}))
-        + "<h2>Time by stage</h2>"
-        + table(head, stages, numeric=frozenset({1, 2, 3, 4}))
-    )
-
-
-def _joined(lines: list[str]) -> str:
-    return "<br>".join(text_html(line) for line in lines)
-
-
-def _number(value: float, unit: str) -> str:
-    return text_html(f"{value:,.4g} {unit}".strip())
+    return Table(head, rows, numeric=frozenset({1, 2, 3, 4}))
 
 
 def _error(share: float | None) -> str:
     return f" ± {100 * share:.0f} %" if share else ""
-
-
-def _calibration(calibration: Mapping[str, object]) -> str:
-    assumed = f"; assumed: {calibration['assumed']}" if calibration["assumed"] else ""
-    return (
-        f"<p>Set <b>{text_html(str(calibration['name']))}</b>: {calibration['clips']} clips, "
-        f"{calibration['frames']} frames{text_html(assumed)}. The task error and the choice of precision are measured "
-        f'on it.</p><p class="quiet">sha256 <code>{text_html(str(calibration["sha256"]))}</code></p>'
-    )
-
-
-def _provenance(report: Report) -> str:
-    provenance = report["provenance"]
-    packages = ", ".join(f"{name} {version}" for name, version in provenance["packages"].items())
-    rows = [
-        ("weights", text_html(provenance["weights_origin"])),
-        ("weights sha256", f"<code>{text_html(provenance['weights_sha256'])}</code>"),
-        ("target", text_html(report["target"])),
-        ("packages", text_html(packages)),
-    ]
-    return table(("what", "value"), rows)

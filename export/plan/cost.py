@@ -117,7 +117,7 @@ def vision_call(config: TicVlaConfig) -> Call:
 
 
 def language_call(config: TicVlaConfig, graph: str, *, tokens: int, past: int) -> Call:
-    """The language model on `tokens` new tokens after `past` in the buffers; `graph` says which parts it has."""
+    """The language model on `tokens` new tokens after `past` in the buffers; `graph` decides which parts it has."""
     c = config.language
     attended = c.heads * c.head_dim
     kv = c.kv_heads * c.head_dim

@@ -1,18 +1,16 @@
 """What fits a target: tick, generation, tokens, duty, power and memory, from a model of the device; or why it does not.
 
-The model, all of whose numbers are a target's figures or measured points:
+All numbers of the model are a target's figures or measured points:
 
 * A call takes the longer of its products at the device's compute peak and its bytes at the memory's bandwidth, each
   times the share of the peak that such kernels reach, plus the provider's overhead (`export/plan/timing.py`).
 * Two threads. Where both use one accelerator they take turns by call and control goes first: a tick waits at most for
-  the call in flight, and reasoning gets the share of time that ticks leave. Where each has cores of its own they slow
-  one another down by measured factors.
+  the call in flight, and reasoning gets the time that ticks leave. On cores of their own they slow one another down.
 * Average power is idle power plus the rise to full load times the share of time in which something runs: an upper
   bound, since a full load was metered with every unit busy. What the budget leaves after control is reasoning's duty.
 * A semantic state is in use until the next one is ready: Δt is at most one generation plus one cycle of generations.
 
-Held against the paper (Table 3: PyTorch, control / reasoning 120.27 / 4831.73 ms on Orin NX, 85.73 / 3430.73 ms on an
-RTX 4060; neither power mode nor token count are given) `tests/export/plan/test_plan.py` states the ratios.
+`tests/export/plan/test_plan.py` states the ratios to the paper's Table 3 (PyTorch, power mode and tokens not given).
 """
 
 from __future__ import annotations
@@ -23,11 +21,23 @@ from dataclasses import dataclass
 from typing import Any
 
 from export.model.config import TicVlaConfig
-from export.plan.memory import GENERATION_STAGES, GIB, TICK_STAGES, Memory, graph_weights, memory_of
-from export.plan.timing import Estimate, StageTime, Work, stage_graph, stage_time, total
+from export.plan.timing import (
+    GENERATION_STAGES,
+    GIB,
+    TICK_STAGES,
+    Estimate,
+    Memory,
+    StageTime,
+    Work,
+    graph_weights,
+    memory_of,
+    stage_graph,
+    stage_time,
+    total,
+)
 from export.quantize.precision import Precision
-from export.target.file import Target
-from export.target.sections import MEASURED, MODELLED, PowerMode
+from export.targets.file import Target
+from export.targets.sections import MEASURED, MODELLED, PowerMode
 
 TEXT_TOKENS = {True: 166, False: 104}
 """Tokens of a prompt beside its frames (chat template, an instruction of 10 words, a way of 8 points, progress),

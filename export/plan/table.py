@@ -7,9 +7,8 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from export.plan.memory import GIB
 from export.plan.plan import Plan
-from export.plan.timing import Estimate
+from export.plan.timing import GIB, Estimate
 from export.quantize.precision import Precision
 
 

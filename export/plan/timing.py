@@ -1,18 +1,32 @@
-"""How long one stage takes: measured if it was, else the roofline of its products and bytes."""
+"""Time of every stage (measured if it was, else the roofline of its products and bytes) and memory of all of them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import statistics
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
-from edge.artifacts.manifest import LANGUAGE_WHOLE
+from edge.artifacts.manifest import LANGUAGE_WHOLE, Artifacts
 from export.model.config import TicVlaConfig
-from export.plan.cost import DECODE, PREFILL, Call, action_call, context_call, language_call, vision_call
+from export.plan.cost import (
+    DECODE,
+    PREFILL,
+    Call,
+    action_call,
+    context_call,
+    context_numbers,
+    language_call,
+    vision_call,
+)
 from export.quantize.precision import Precision
-from export.target.file import Target
-from export.target.sections import KV_DTYPES, MEASURED, MODELLED, Figure, Measured, Provider
+from export.targets.file import Target
+from export.targets.sections import KV_DTYPES, MEASURED, MODELLED, Figure, Measured
 
+GIB = 1 << 30
+TICK_STAGES = ("vision_encoder", "action_expert")
+GENERATION_STAGES = ("prefill", "decode", "semantic_context")
 SAME_LENGTH = 0.05
 """A measurement at a length within this share of the wanted one stands for it; else it only scales the model."""
 
@@ -88,16 +102,12 @@ class Work:
         return self.prompt_tokens + self.new_tokens
 
 
-def language_graph(target: Target, stage: str) -> str:
-    """The graph that does `prefill` or `decode`."""
-    if LANGUAGE_WHOLE[0] in target.graphs:
-        return LANGUAGE_WHOLE[0]
-    return PREFILL if stage == "prefill" else DECODE
-
-
 def stage_graph(target: Target, stage: str) -> str:
     """The graph of a stage."""
-    return language_graph(target, stage) if stage in ("prefill", "decode") else stage
+    pair = {"prefill": PREFILL, "decode": DECODE}
+    if stage in pair and LANGUAGE_WHOLE[0] in target.graphs:
+        return LANGUAGE_WHOLE[0]
+    return pair.get(stage, stage)
 
 
 def stage_calls(config: TicVlaConfig, graph: str, stage: str, work: Work) -> list[tuple[Call, int]]:
@@ -127,7 +137,8 @@ def stage_time(target: Target, config: TicVlaConfig, stage: str, precision: Prec
     per = calls if stage == "decode" else 1  # a decode point is per token, any other for the whole stage
     where = f"measured on {point.machine}, {point.date}"
     same_chunks = point.chunk_tokens is None or point.chunk_tokens == work.chunk_tokens
-    timed = _timed(config, stage)
+    # Points name a model, and its action expert was measured with the query head.
+    timed = replace(config, action=replace(config.action, head="query")) if stage == "action_expert" else config
     if (taken is None or abs(wanted - taken) <= SAME_LENGTH * taken) and same_chunks and timed == config:
         whole = Estimate(measured_ms * per, point.error, MEASURED, where)
         # Only the whole was measured: its longest call is the model's share of it.
@@ -145,13 +156,6 @@ def stage_time(target: Target, config: TicVlaConfig, stage: str, precision: Prec
     ]
     energy_j = None if point.energy_j is None else point.energy_j * scaled[0].ms / measured_ms
     return replace(modelled, whole=scaled[0], each=scaled[1], energy_j=energy_j)
-
-
-def _timed(config: TicVlaConfig, stage: str) -> TicVlaConfig:
-    """What a stage's measurements are of: points name a model, and its action expert was measured with queries."""
-    if stage != "action_expert":
-        return config
-    return replace(config, action=replace(config.action, head="query"))
 
 
 def _length(stage: str, work: Work) -> int:
@@ -174,7 +178,7 @@ def _point(target: Target, model: str, graph: str, stage: str, precision: Precis
     """The newest measurement of exactly this, the last one listed among equals."""
     policy = target.graphs[graph]
     threads = policy.threads or 1
-    # A whole language model's points say by their unit which of its two stages they are.
+    # The unit of a whole language model's point tells prefill (ms) from decoding (tokens/s).
     per_token = {"prefill": False, "decode": True}.get(stage)
     found = [
         point
@@ -220,7 +224,9 @@ def _call_ms(
     """Time of one call in ms, its relative error, and what bounds it."""
     provider, roofline, mode = target.provider(graph), target.roofline, target.power.selected
     efficiency = roofline.compute_efficiency[stage]
-    cores = _cores_share(target, graph, provider)
+    cores = 1.0  # share of the processor
+    if provider.uses_cores:
+        cores = min(target.graphs[graph].threads or 1, target.device.cores) / target.device.cores
     work = [(provider.compute.attention, call.attention_flops)]
     for name, flops in call.linear_flops(precision).items():
         roof = provider.compute.roof(name)
@@ -248,13 +254,98 @@ def _call_ms(
     return whole, spread / whole if spread else None, bound
 
 
-def _cores_share(target: Target, graph: str, provider: Provider) -> float:
-    if not provider.uses_cores:
-        return 1.0
-    return min(target.graphs[graph].threads or 1, target.device.cores) / target.device.cores
-
-
 def _together(*errors: float | None) -> float | None:
     """Independent relative errors of factors."""
     known = [error for error in errors if error is not None]
     return math.sqrt(sum(error**2 for error in known)) if known else None
+
+
+@dataclass(frozen=True)
+class Memory:
+    """Bytes on the device that the model takes, by what for, and what there is for it."""
+
+    weights: int
+    caches: int
+    activations: int
+    workspace: int
+    available: int
+
+    @property
+    def needed(self) -> int:
+        """Sum of what it takes."""
+        return self.weights + self.caches + self.activations + self.workspace
+
+
+def graph_weights(target: Target, config: TicVlaConfig, graph: str, precision: Precision, work: Work) -> int:
+    """Bytes of a graph's weights."""
+    stage = {"language_model": "prefill", "language_model.prefill": "prefill", "language_model.decode": "decode"}
+    call = stage_calls(config, graph, stage.get(graph, graph), work)[0][0]
+    return call.weights(precision, target.provider(graph).activation_bytes)
+
+
+def memory_of(target: Target, config: TicVlaConfig, work: Work, weights: int) -> Memory:
+    """What a model whose weights take `weights` bytes needs on the target's device."""
+    language = config.language
+    kv_bytes = KV_DTYPES[target.runtime.kv_dtype]
+    caches = 2 * language.layers * language.kv_heads * language.head_dim * language.max_context
+    # The context in use and the next one; the ring of encoded frames is kept in fp32.
+    contexts = 2 * context_numbers(config, work.context_tokens)
+    frames = (len(target.runtime.frame_offsets_s) + 1) * config.vision.tokens * config.vision.token_dim * 4
+    activations = max(
+        call.workspace * target.provider(graph).activation_bytes
+        for stage in (*TICK_STAGES, *GENERATION_STAGES)
+        for graph in (stage_graph(target, stage),)
+        for call, _ in stage_calls(config, graph, stage, work)
+    )
+    providers = {target.graphs[name].provider for name in target.graph_names}
+    workspace = sum(target.providers[name].workspace_gib.value for name in providers)
+    return Memory(
+        weights=weights,
+        caches=(caches + contexts) * kv_bytes + frames,
+        activations=2 * activations,  # both threads run
+        workspace=round(workspace * GIB),
+        available=round((target.device.memory_gib - target.device.reserved_gib) * GIB),
+    )
+
+
+def measured_point(
+    target: Target,
+    manifest: Mapping[str, Any],
+    artifacts: Artifacts,
+    stage: str,
+    samples: Mapping[str, Any],
+    *,
+    machine: str,
+    date: str,
+    energy_j: float | None = None,
+) -> Measured:
+    """The point of one stage: `samples` has its times in ms (decode: of a token), and `prompt` and `new` tokens.
+
+    `energy_j` is the energy above idle of one such time. Raises TargetError for a time that is no time.
+    """
+    graph = stage_graph(target, stage)
+    policy, times_ms = target.graphs[graph], samples[stage]
+    precision = Precision.from_dict(manifest["graphs"][graph]["precision"])
+    median_ms = statistics.median(times_ms)
+    context = samples["prompt"] + samples["new"]
+    tokens = {"prefill": samples["prompt"], "decode": samples["prompt"] + samples["new"] // 2}.get(stage, context)
+    threads = artifacts.graphs[graph].session.threads or 1
+    return Measured(
+        model=artifacts.model_name,
+        graph=graph,
+        precision=precision.default,
+        overrides=dict(precision.overrides),
+        form=policy.form,
+        provider=policy.provider,
+        machine=machine,
+        date=date,
+        ms=None if stage == "decode" else round(median_ms, 3),
+        tokens_per_s=round(1000 / median_ms, 2) if stage == "decode" else None,
+        tokens=None if stage == "vision_encoder" else tokens,
+        chunk_tokens=artifacts.runtime.prefill_chunk_tokens if stage == "prefill" else None,
+        threads=threads if target.providers[policy.provider].uses_cores else None,
+        mode=target.power.mode,
+        # Half the spread of the samples: what a repetition may differ by, not what another machine does.
+        error=round(min(0.99, (max(times_ms) - min(times_ms)) / 2 / median_ms), 3),
+        energy_j=None if energy_j is None else round(energy_j, 6),
+    )

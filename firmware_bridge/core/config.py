@@ -132,8 +132,8 @@ class SafetyConfig(_Section):
     def __post_init__(self) -> None:
         super().__post_init__()
         keys = self.remote_estop_keys
-        known = len(keys) > 0 and set(keys) <= set(REMOTE_KEYS)
-        _require(known, f"safety.remote_estop_keys: expected one or more of {', '.join(REMOTE_KEYS)}, found {keys}")
+        valid = len(keys) > 0 and set(keys) <= set(REMOTE_KEYS)
+        _require(valid, f"safety.remote_estop_keys: expected one or more of {', '.join(REMOTE_KEYS)}, found {keys}")
         file_ok = self.estop_file is None or self.estop_file.is_absolute()
         _require(file_ok, f"safety.estop_file: expected an absolute path, found {self.estop_file}")
 
@@ -163,7 +163,7 @@ class CameraConfig(_Section):
 @dataclass(frozen=True)
 class MountConfig(_Section):
     """How the front camera is mounted: horizontal field of view, lens above the floor and ahead of the base while the
-    robot stands, and how far it looks down. Visual odometry needs it.
+    robot stands, and its pitch downwards. Visual odometry needs it.
     """
 
     hfov_deg: float = _within(20, 160)
@@ -231,7 +231,7 @@ def runtime_dir() -> Path:
 
 
 def load_robot_config(path: Path | str, *, socket: Path | None = None, domain: int | None = None) -> RobotConfig:
-    """Read a robot file; `socket` and `domain` replace what it says. Raises ConfigError with one clear line."""
+    """Read a robot file; `socket` and `domain` replace its own. Raises ConfigError with one clear line."""
     try:
         table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, RecursionError, tomllib.TOMLDecodeError) as error:

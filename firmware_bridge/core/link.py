@@ -34,7 +34,7 @@ client, or a denied request of ours; second_publisher: an input topic has more t
 have one; link_down: the network does not take our commands; state_silent: no usable report from the robot;
 wrong_mode: it left its walking modes; robot_error: its error code; tipped: rolled or pitched beyond 30 degrees;
 robot_moving: found moving when the bridge started; not_standing: it did not stand up in time; battery_low: less charge
-than the robot file asks for; wrong_robot: its sport service has not the robot file's version, or does not say;
+than the robot file asks for; wrong_robot: its sport service has not the robot file's version, or it does not answer;
 operator: the robot file asks for an operator's `edge-bridge arm`, which has not come yet.
 """
 PERMITS: Final = ("not needed", "needed", "given")
@@ -85,9 +85,9 @@ class BridgeStatus:
     """What the bridge is doing: `commands` velocity commands written to the robot, `last_command` the newest of them.
 
     `zero_after_stop`: stopped, and a zero velocity has been written since, and nothing else. It is True too when the
-    bridge never commanded the robot at all. `cause` (of CAUSES) says why it last stopped or refused to arm, `reason`
-    the same in words; `blocked_by` (of CAUSES) says what would make it refuse to arm now. `permit` is one of PERMITS,
-    `motion` one of MOTIONS, `speed_mps` the robot's own speed, -1 without a fresh report.
+    bridge never commanded the robot at all. `cause` (of CAUSES) is why it last stopped or refused to arm, `reason`
+    the same as a sentence; `blocked_by` (of CAUSES) is what would make it refuse to arm now. `permit` is one of
+    PERMITS, `motion` one of MOTIONS, `speed_mps` the robot's own speed, -1 without a fresh report.
     """
 
     stamp_ns: int
@@ -153,8 +153,8 @@ def decode(data: bytes) -> Message:
 
 def _decode_status(body: bytes) -> BridgeStatus:
     stamp_ns, state, zero, cause, blocked, permit, motion, *counters, vx, vy, wz, speed = _STATUS_BODY.unpack_from(body)
-    known = state < len(STATES) and zero <= 1 and permit < len(PERMITS) and motion < len(MOTIONS)
-    if not known or max(cause, blocked) >= len(CAUSES):
+    valid = state < len(STATES) and zero <= 1 and permit < len(PERMITS) and motion < len(MOTIONS)
+    if not valid or max(cause, blocked) >= len(CAUSES):
         raise LinkError(f"state {state}, flag {zero}, causes {cause} and {blocked}, permit {permit}, motion {motion}")
     try:
         reason = body[_STATUS_BODY.size :].decode("utf-8")

@@ -96,7 +96,7 @@ class BridgeCore:
         if self._state == "armed" and now_ns > self._good_until_ns:
             # Before the messages: what has queued up while this process stood still must not feed the deadman.
             self._stop("deadman", "deadman: no good command in time", now_ns)
-        self._hear_operator(inputs, now_ns)
+        self._handle_operator(inputs, now_ns)
         danger = self._danger(now_ns)
         if danger is not None:
             self._stop(*danger, now_ns)
@@ -145,7 +145,7 @@ class BridgeCore:
             self._stop("suspended", "this machine was suspended", now_ns)
         self._asleep_ns = inputs.asleep_ns
 
-    def _hear_operator(self, inputs: Inputs, now_ns: int) -> None:
+    def _handle_operator(self, inputs: Inputs, now_ns: int) -> None:
         """Emergency stops of every source, then an operator's arm or release; a stop beside them wins."""
         stop = any(isinstance(message, Stop) for message in inputs.operator)
         pressed = (stop, inputs.estop, inputs.robot.remote_estop)
@@ -159,8 +159,8 @@ class BridgeCore:
             self._take_permission(now_ns)
         elif not stop and any(isinstance(message, Release) for message in inputs.operator):
             self._release()
-        known = (Arm, Stop, Release)  # only the runner's socket commands
-        self._rejected += sum(not isinstance(message, known) for message in inputs.operator)
+        accepted = (Arm, Stop, Release)  # only the runner's socket commands
+        self._rejected += sum(not isinstance(message, accepted) for message in inputs.operator)
 
     def _engage(self, now_ns: int) -> None:
         """A new press: end a release, and stop a robot that moves although this bridge has not driven it."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from firmware_bridge.core.link import BridgeStatus, Message
-from firmware_bridge.unitree.messages.state import RobotState
+from firmware_bridge.core.robot_state import RobotState
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class Report:
 
     `remote_in_use`: a stick or key of the robot's remote is in use. `remote_estop`: its emergency-stop keys were
     pressed. `foreign` names a motion or mode request of another client. `denied` names a request of ours that the
-    robot denied because another client holds its lease. `publishers` says which input topic has more than one
+    robot denied because another client holds its lease. `publishers` names the input topic that has more than one
     publisher, or that a foreign program publishes motor commands. `version` is the sport service's answer to our
     question. `writes_fail`: the network has refused our last commands.
     """

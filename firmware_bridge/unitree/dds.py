@@ -15,6 +15,7 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 
 from firmware_bridge.core.config import DdsConfig
+from firmware_bridge.core.robot_state import DdsError
 from firmware_bridge.unitree.messages.binding import take_undecoded
 
 # Everything a hostile or foreign sample can make the pure-Python CDR decoder raise.
@@ -23,10 +24,6 @@ MAX_SAMPLE_BYTES: Final = 10 * 1024 * 1024  # more than a camera frame
 # What a call into DDS itself can raise.
 DDS_ERRORS: Final = (DDSException,)
 _FRESH: Final = ViewState.Any | InstanceState.Alive | SampleState.NotRead
-
-
-class DdsError(RuntimeError):
-    """DDS cannot start; one line for the operator."""
 
 
 def domain_xml(config: DdsConfig, max_sample_bytes: int = MAX_SAMPLE_BYTES) -> str:

@@ -83,7 +83,7 @@ class Requester:
         return self._last_id
 
     def responses(self, limit: int = 64, max_bytes: int = MAX_SAMPLE_BYTES) -> list[Response]:
-        """Answers that have arrived since the last look, other clients' included; at most `limit` of them.
+        """Answers that have arrived since the last call, other clients' included; at most `limit` of them.
 
         One of more than `max_bytes` counts as malformed without being decoded.
         """

@@ -1,4 +1,4 @@
-"""The bridge's end of the robot's network: what it hears there as one `Report` a step, and the requests it writes."""
+"""The bridge's end of the robot's network: what arrives there as one `Report` a step, and the requests it writes."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ from typing import Any, Final
 from cyclonedds.sub import DataReader
 
 from firmware_bridge.core.config import RobotConfig
+from firmware_bridge.core.robot_state import RobotState, StampOrder, within
 from firmware_bridge.core.step_types import Call, Move, Report
 from firmware_bridge.unitree.dds import Bus, take_each
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.messages.idl import Request_, SportModeState_, WirelessController_
 from firmware_bridge.unitree.messages.idl_low import LowState_
-from firmware_bridge.unitree.messages.state import RobotState, StampOrder, battery_state, robot_state, within
 from firmware_bridge.unitree.publishers import PublisherWatch
 from firmware_bridge.unitree.remote import StopKeys
+from firmware_bridge.unitree.report import battery_state, robot_state
 from firmware_bridge.unitree.requests import Requester, move_parameter
 
 _MAX_UNANSWERED: Final = 32
@@ -32,9 +33,9 @@ _MAX_KEPT_BYTES: Final = 1024 * 1024  # times 51, the depth of all readers: far 
 class RobotLink:
     """All readers and the only writer. Nothing here waits. Raises DdsError when the bus cannot be joined."""
 
-    def __init__(self, config: RobotConfig, say: Callable[[str], None]) -> None:
-        """`say` is told, in one line, when the robot answers a request with an error."""
-        self._say = say
+    def __init__(self, config: RobotConfig, report: Callable[[str], None]) -> None:
+        """`report` takes one line when the robot answers a request with an error."""
+        self._report = report
         self._velocity_frame = config.odometry.velocity_frame
         self._deadband = config.safety.remote_deadband
         self._stop_keys = StopKeys(config.safety.remote_estop_keys)
@@ -93,7 +94,7 @@ class RobotLink:
             if sample is None:
                 self._malformed += 1
                 continue
-            estop |= self._stop_keys.press(sample.keys, now_ns)  # whatever the sticks say
+            estop |= self._stop_keys.press(sample.keys, now_ns)  # whatever the sticks report
             if within(_MAX_STICK, sample.lx, sample.ly, sample.rx, sample.ry):
                 in_use |= sample.keys != 0 or not within(self._deadband, sample.lx, sample.ly, sample.rx, sample.ry)
             else:
@@ -127,7 +128,7 @@ class RobotLink:
             api_id = self._sent.pop(answer.request_id, None)
             if api_id is not None and answer.code != ids.OK:
                 denied = ids.SPORT_API_NAMES[api_id] if answer.code in ids.LEASE_ERRORS else denied
-                self._say(f"the robot answered {ids.SPORT_API_NAMES[api_id]} with error {answer.code}")
+                self._report(f"the robot answered {ids.SPORT_API_NAMES[api_id]} with error {answer.code}")
             elif api_id == ids.API_VERSION:
                 version = answer.data[:_MAX_VERSION_CHARS] or "nothing"
         return version, denied

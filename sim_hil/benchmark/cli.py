@@ -6,7 +6,6 @@ import argparse
 import shutil
 import sys
 import tempfile
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -41,12 +40,11 @@ from sim_hil.benchmark.conditions.latency import LatencyError, LatencyProfile, p
 from sim_hil.benchmark.conditions.rewording import reworded
 from sim_hil.benchmark.policies.external_protocol import Address, ExternalError
 from sim_hil.benchmark.results.report import write_report
-from sim_hil.benchmark.results.store import ResultStore, StoreError
+from sim_hil.benchmark.results.store import ResultStore, StoreError, read_results
+from sim_hil.benchmark.runs import RESULT, BenchRun, choose, execute
 from sim_hil.benchmark.suite.episode import SuiteError, load_suite, suite_names
-from sim_hil.benchmark.workers.bench_run import BenchRun, bench_result, choose
 from sim_hil.benchmark.workers.cluster import ClusterError, ClusterJobs
-from sim_hil.benchmark.workers.jobs import Backend, RefusedRunError
-from sim_hil.benchmark.workers.local_jobs import LocalJobs
+from sim_hil.benchmark.workers.jobs import Backend, LocalJobs, RefusedRunError
 from sim_hil.benchmark.workers.progress import BenchProgress
 from sim_hil.benchmark.workers.realtime_episode import check_realtime, drivable
 from sim_hil.benchmark.workers.task import VIDEO_CHOICES
@@ -211,18 +209,14 @@ def _run(args: argparse.Namespace) -> int:
             raise ConditionsError("--clock realtime: expected an episode of the go2 among --episodes, found none")
     episodes = list(reworded(episodes, conditions, lambda: load_suite(args.suite)))
     run = BenchRun.plan(args.suite, episodes, conditions)
-    started_ns = time.monotonic_ns()
     with _output_directory(args.out) as folder, stop_signals() as stop:
-        backend, store = _backend(args), None
-        try:
-            store = (ResultStore.resume if args.resume else ResultStore.create)(folder, run.config())
-            with BenchProgress(len(run.episodes), len(store.results)) as progress:
-                finished = run.run(store, backend, args.video, lambda: bool(stop), progress.watcher)
-        finally:
-            backend.close()
-            if store is not None:
-                store.close()
-        result = bench_result(run, store, finished=finished, started_ns=started_ns)
+        done = len(read_results(folder)) if args.resume else 0
+        with BenchProgress(len(run.episodes), done) as progress:
+            execution = execute(
+                run, folder, _backend(args), resume=args.resume, video=args.video, stopped=lambda: bool(stop),
+                watcher=progress.watcher,
+            )  # fmt: skip
+        store, finished, result = execution.store, execution.finished, execution.result
         result["skipped"] = skipped
         _write_outputs(args, store, result)
     if not finished:
@@ -255,7 +249,7 @@ def _output_directory(out: Path | None) -> Iterator[Path]:
 def _write_outputs(args: argparse.Namespace, store: ResultStore, result: dict[str, Any]) -> None:
     write_result(args.json, result)
     if args.out is not None:
-        write_result(str(store.directory / "result.json"), result)
+        write_result(str(store.directory / RESULT), result)
         report = write_report(store, result["summary"], f"DynaNav: {Path(args.suite).stem}, {args.policy}")
         sys.stderr.write(f"edge-bench: {report}\n")
     if result["code_changed"]:

@@ -1,24 +1,209 @@
-"""Run the benchmark from a program instead of the command line; existing results are kept."""
+"""A benchmark run: its plan, execution and result; from a program, existing results are kept."""
 
 from __future__ import annotations
 
+import hashlib
 import json
+import platform
+import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from fnmatch import fnmatchcase
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from edge.core.cli import write_whole
-from sim_hil.benchmark.conditions.conditions import Conditions
+from edge.core.stats import percentiles
+from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.conditions.rewording import reworded
-from sim_hil.benchmark.results.record import EpisodeResult
-from sim_hil.benchmark.results.store import CONFIG, ResultStore
+from sim_hil.benchmark.policies.select import check_artifacts, open_policy
+from sim_hil.benchmark.results.record import EpisodeResult, read_log
+from sim_hil.benchmark.results.store import CONFIG, EPISODES, ResultStore
+from sim_hil.benchmark.results.summary import summarise
 from sim_hil.benchmark.suite.episode import Episode, load_suite
-from sim_hil.benchmark.workers.bench_run import BenchRun, bench_result
-from sim_hil.benchmark.workers.jobs import RunWatcher
-from sim_hil.benchmark.workers.local_jobs import LocalJobs
+from sim_hil.benchmark.workers.code_version import code_sha256
+from sim_hil.benchmark.workers.jobs import Backend, LocalJobs, RunWatcher, run_all
+from sim_hil.benchmark.workers.run_episode import RUNNERS
+from sim_hil.benchmark.workers.task import EpisodeTask
 
 RESULT = "result.json"
+SCHEMA = 1
+_PACKAGES = (
+    "tic-vla-edge",
+    "numpy",
+    "pybullet",
+    "panda3d",
+    "scipy",
+    "onnxruntime",
+    "opencv-python-headless",
+)
+
+
+@dataclass(frozen=True)
+class BenchRun:
+    """Plan of a run; `trained`: from the manifest, True for a policy without one."""
+
+    suite: str
+    episodes: tuple[Episode, ...]
+    conditions: Conditions
+    manifest_sha256: str
+    trained: bool
+
+    @staticmethod
+    def plan(suite: str, episodes: Sequence[Episode], conditions: Conditions) -> BenchRun:
+        """Check everything that is known before the first episode, and connect once to an external policy.
+
+        Raises ArtifactError, ConditionsError, ExternalError.
+        """
+        if conditions.clock not in RUNNERS:
+            raise ConditionsError(
+                f"--clock {conditions.clock}: not in this version; expected {', '.join(sorted(RUNNERS))}"
+            )
+        artifacts = check_artifacts(conditions)
+        if artifacts is not None:
+            conditions = conditions.with_defaults_of(artifacts.runtime.decoding, artifacts.runtime.recovery)
+        sha256, trained = ("", True) if artifacts is None else (artifacts.manifest_sha256, artifacts.trained)
+        run = BenchRun(suite, tuple(episodes), conditions, sha256, trained)
+        run.tasks(Path())
+        if conditions.policy.kind == "external":
+            open_policy(conditions).close()
+        return run
+
+    def config(self) -> dict[str, Any]:
+        """Return the configuration that a resumed run must share."""
+        return {
+            "schema": SCHEMA,
+            "suite": self.suite,
+            "suite_sha256": hashlib.sha256(
+                json.dumps([asdict(episode) for episode in self.episodes], sort_keys=True).encode()
+            ).hexdigest(),
+            "episodes": [episode.id for episode in self.episodes],
+            "conditions": self.conditions.as_json(),
+            "manifest_sha256": self.manifest_sha256,
+            "trained": self.trained,
+            "versions": versions(),
+        }
+
+    def tasks(self, folder: Path, video: str = "none") -> list[EpisodeTask]:
+        """Return one task per episode, the longest first, for an even load. Raises ConditionsError."""
+        tasks = [
+            EpisodeTask(episode, self.conditions, folder, video, self.manifest_sha256) for episode in self.episodes
+        ]
+        # Simulation time grows with the time limit and the crowd.
+        return sorted(tasks, key=lambda task: -task.episode.timeout_s * (20 + task.episode.people))
+
+
+def choose(episodes: Sequence[Episode], patterns: Sequence[str]) -> list[Episode]:
+    """Return the episodes whose id matches a pattern, all without patterns. Raises ConditionsError if none matches."""
+    for pattern in patterns:
+        if not any(fnmatchcase(episode.id, pattern) for episode in episodes):
+            some = ", ".join(episode.id for episode in episodes[:3])
+            raise ConditionsError(
+                f"--episodes {pattern!r}: expected a pattern of ids such as {some}, ...; none matches"
+            )
+    wanted = patterns or ("*",)
+    return [episode for episode in episodes if any(fnmatchcase(episode.id, pattern) for pattern in wanted)]
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of code and packages, on which results may depend."""
+    found = {"python": platform.python_version(), "machine": platform.machine(), "system": sys.platform}
+    found["code"] = code_sha256()
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed as a package"
+    return found
+
+
+def bench_result(run: BenchRun, store: ResultStore, *, finished: bool, started_ns: int) -> dict[str, Any]:
+    """Return the result for `--json`."""
+    results = sorted(store.results, key=lambda result: result.id)
+    wall_s = (time.monotonic_ns() - started_ns) / 1e9
+    return {
+        "summary": {
+            **summarise(results),
+            "asked": len(run.episodes),
+            "failed_runs": len(store.failed),
+            "finished": finished,
+        },
+        "episodes": [result.as_json() for result in results],
+        "failed_runs": [asdict(failed) for failed in store.failed],
+        "latency": latency_result(store.directory, run.conditions, results),
+        "conditions": run.conditions.as_json(),
+        "suite": run.suite,
+        "suite_sha256": run.config()["suite_sha256"],
+        "manifest_sha256": run.manifest_sha256,
+        "trained": run.trained,
+        "versions": store.config["versions"],
+        "code_changed": store.config["versions"]["code"] != code_sha256(),
+        "wall_s": round(wall_s, 1),
+        "simulated_s": round(sum(result.time_s for result in results), 1),
+        "tagged": "measured",
+    }
+
+
+def latency_result(directory: Path, conditions: Conditions, results: Sequence[EpisodeResult]) -> dict[str, Any]:
+    """Return the delays over all control periods of all episodes, and their latency profile."""
+    delays: list[float] = []
+    for result in results:
+        if result.delay_s is not None:
+            try:
+                columns: Mapping[str, Any] = read_log(directory / EPISODES / f"{result.id}.json")["columns"]
+            except (OSError, ValueError):
+                continue  # the log was removed; use the others
+            delays += [delay for delay in columns["delay_s"] if delay is not None]
+    profile = conditions.latency
+    return {
+        "delay_s": {
+            "mean": round(sum(delays) / len(delays), 4) if delays else None,
+            **percentiles(delays, "p50", "p99", "max"),
+        },
+        "periods": len(delays),
+        "profile": None if profile is None else profile.name,
+        "profile_mean_s": None if profile is None else round(profile.mean_s, 4),
+        "profile_source": None if profile is None else profile.source,
+        "profile_tagged": None if profile is None else profile.tagged,
+    }
+
+
+@dataclass(frozen=True)
+class Execution:
+    """An executed run: its closed store, its result for `--json`, and the number of episodes that it has added."""
+
+    store: ResultStore
+    finished: bool
+    result: dict[str, Any]
+    added: int
+
+
+def execute(
+    run: BenchRun,
+    directory: Path,
+    backend: Backend,
+    *,
+    resume: bool,
+    video: str = "none",
+    stopped: Callable[[], bool],
+    watcher: RunWatcher | None = None,
+) -> Execution:
+    """Run the episodes that `directory` lacks, then close the backend. Raises StoreError, RefusedRunError, OSError."""
+    started_ns = time.monotonic_ns()
+    store: ResultStore | None = None
+    try:
+        store = (ResultStore.resume if resume else ResultStore.create)(directory, run.config())
+        before = len(store.results)
+        tasks = run.tasks(store.directory, video)
+        finished = run_all(tasks, backend, store, stopped=stopped, watcher=watcher)
+    finally:
+        backend.close()
+        if store is not None:
+            store.close()
+    result = bench_result(run, store, finished=finished, started_ns=started_ns)
+    return Execution(store, finished, result, len(store.results) - before)
 
 
 class RunsError(RuntimeError):
@@ -43,20 +228,11 @@ def run_episodes(
     """
     chosen = reworded(episodes, conditions, lambda: load_suite(suite))
     run = BenchRun.plan(suite, chosen, conditions)
-    started_ns = time.monotonic_ns()
-    backend = LocalJobs(jobs)
-    store: ResultStore | None = None
-    try:
-        store = (ResultStore.resume if (out / CONFIG).is_file() else ResultStore.create)(out, run.config())
-        before = len(store.results)
-        finished = run.run(store, backend, "none", stopped, watcher or RunWatcher())
-    finally:
-        backend.close()
-        if store is not None:
-            store.close()
-    if len(store.results) > before or not (out / RESULT).is_file():
-        result = bench_result(run, store, finished=finished, started_ns=started_ns)
-        write_whole(out / RESULT, json.dumps(result, indent=1) + "\n")
+    resume = (out / CONFIG).is_file()
+    execution = execute(run, out, LocalJobs(jobs), resume=resume, stopped=stopped, watcher=watcher)
+    store, finished = execution.store, execution.finished
+    if execution.added or not (out / RESULT).is_file():
+        write_whole(out / RESULT, json.dumps(execution.result, indent=1) + "\n")
     if not finished:
         raise KeyboardInterrupt
     if store.failed:

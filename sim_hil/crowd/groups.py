@@ -52,7 +52,7 @@ class Groups:
         self.onward_s = np.zeros(crowd.n)  # time until which a follower walks alone, s
         self._c, self._s = np.cos(crowd.heading), np.sin(crowd.heading)  # direction of the leaders
 
-    def patience(self, crowd: Crowd) -> Array:
+    def patience(self) -> Array:
         """Return the share of their speed at which leaders walk [n], so that followers keep up."""
         return np.clip(1.75 - 0.5 * self._furthest, np.where(self._waited_s < _WAIT_S, 0.0, 0.35), 1.0)
 

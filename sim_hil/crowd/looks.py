@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Final
 
 import numpy as np
@@ -35,10 +34,6 @@ class Appearance:
     bag: Rgb
 
 
-TOPS: Final = ("shirt", "jacket", "coat", "scrubs", "lab_coat", "vest")
-LEGS: Final = ("trousers", "skirt", "shorts", "dress")
-HAIR_STYLES: Final = ("short", "long", "bun", "bald", "cap", "helmet")
-
 _SHIRTS: Final[tuple[Rgb, ...]] = (
     (188, 42, 40), (36, 88, 160), (232, 196, 70), (60, 130, 80), (235, 235, 230), (110, 60, 140), (225, 120, 40),
     (120, 170, 210), (40, 44, 52), (205, 150, 160), (150, 155, 160), (30, 110, 115), (245, 220, 190),
@@ -66,12 +61,7 @@ _VESTS: Final[tuple[Rgb, ...]] = ((240, 120, 20), (200, 230, 40))
 _HELMETS: Final[tuple[Rgb, ...]] = ((250, 205, 40), (245, 245, 240), (40, 90, 190), (230, 90, 30))
 
 # Shares of people in work clothes, by the prefix of the scene's name; the others wear everyday clothes.
-_AT_WORK: Final = MappingProxyType(
-    {
-        "hospital": (("scrubs", 0.28), ("lab_coat", 0.22)),
-        "warehouse": (("vest", 0.75),),
-    }
-)
+_AT_WORK: Final = {"hospital": (("scrubs", 0.28), ("lab_coat", 0.22)), "warehouse": (("vest", 0.75),)}
 
 
 def appearances(count: int, seed: int, scene_name: str = "") -> list[Appearance]:

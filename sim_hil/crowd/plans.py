@@ -7,12 +7,10 @@ from math import atan2, hypot
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_hil.crowd.courtesy import Courtesy
+from sim_hil.crowd.courtesy import Courtesy, Jams
 from sim_hil.crowd.groups import Groups
-from sim_hil.crowd.jams import Jams
 from sim_hil.crowd.senses import ObservedRobot
-from sim_hil.crowd.spots import route_spots, spots_of
-from sim_hil.crowd.start import Start
+from sim_hil.crowd.spots import Start, route_spots, spots_of
 from sim_hil.crowd.state import Activity, Crowd
 from sim_hil.crowd.walkable_map import CrowdMap
 from sim_hil.scene.scene import Scene, Vec2
@@ -41,7 +39,7 @@ class Plans:
             self._spots, self._routes = route_spots(scene)
         else:
             self._spots = spots_of(scene, ways, crowd.n, rng)
-        ways.add_destinations([spot.reach for spot in self._spots])
+        ways.set_destinations([spot.reach for spot in self._spots])
         self._spot_gaps = ways.gaps_at(*(np.array([spot.reach[axis] for spot in self._spots]) for axis in (0, 1)))
         self._stop = np.array([_may_stop(scene, *spot.reach) for spot in self._spots])
         self._ends = np.array([spot.kind != "way" for spot in self._spots])
@@ -357,7 +355,7 @@ class Plans:
         dx = np.where(near, fx, np.where(roomy, sx - x, dx))
         dy = np.where(near, fy, np.where(roomy, sy - y, dy))
         norm = np.sqrt(dx * dx + dy * dy) + 1e-9
-        pace = crowd.free_mps[who] * self._groups.patience(crowd)[who]
+        pace = crowd.free_mps[who] * self._groups.patience()[who]
         ends = self._ends[crowd.spot[who]]
         pace = np.where(near & ends, np.minimum(pace, 0.35 + 0.6 * left), pace)
         return dx / norm * pace, dy / norm * pace

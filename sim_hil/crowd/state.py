@@ -25,8 +25,7 @@ class Activity:
 class Crowd:
     """State of n people: positions m, velocities m/s, headings rad; traits are drawn once from `rng`."""
 
-    def __init__(self, count: int, rng: np.random.Generator) -> None:
-        n = count
+    def __init__(self, n: int, rng: np.random.Generator) -> None:
         self.n = n
         self.now_s = 0.0
         self.x, self.y, self.vx, self.vy = (np.zeros(n) for _ in range(4))
@@ -51,10 +50,7 @@ class Crowd:
         self.activity = np.zeros(n, dtype=np.int64)
         self.spot = np.full(n, -1, dtype=np.int64)  # current destination
         self.target_x, self.target_y = np.zeros(n), np.zeros(n)
-        self.preferred_vx, self.preferred_vy = (
-            np.zeros(n),
-            np.zeros(n),
-        )  # preferred velocity without others, m/s; 0: stands
+        self.preferred_vx, self.preferred_vy = np.zeros(n), np.zeros(n)  # velocity without others, m/s; 0: stands
         self.until_s = np.zeros(n)
         self.leader = np.full(n, -1, dtype=np.int64)
         self.group = np.arange(n, dtype=np.int64)

@@ -41,9 +41,7 @@ class CrowdMap:
         (x0, y0), (x1, y1) = scene.floor_min_m, scene.floor_max_m
         area = (x1 - x0) * (y1 - y0)
         fine = min(max(sqrt(area / _FINE_CELLS), 0.1), 0.2)
-        grid = NavGrid(
-            scene, clearance_m=_REQUIRED_M, resolution_m=fine, height_m=_HEAD_M, max_step_m=_KERB_M
-        )  # fmt: skip
+        grid = NavGrid(scene, clearance_m=_REQUIRED_M, resolution_m=fine, height_m=_HEAD_M, max_step_m=_KERB_M)
         self._fine, self._origin = fine, np.array(grid.origin_m)
         self._gaps = np.ascontiguousarray(grid.clearances)
         self._rows, self._columns = self._gaps.shape
@@ -52,8 +50,6 @@ class CrowdMap:
         self._coarse = fine * self._skip
         self._ground = _ground(scene, self._gaps.shape, grid.origin_m, fine) if scene.terrain else None
         self._build_ways(scene)
-        self._ahead: list[NDArray[np.int32]] = []
-        self._lengths: list[NDArray[np.float32]] = []
 
     def _build_ways(self, scene: Scene) -> None:
         half, skip = self._skip // 2, self._skip
@@ -183,22 +179,21 @@ class CrowdMap:
         y = self._origin[1] + cells[:, 0] * self._coarse + offset
         return x, y, self._gaps[cells[:, 0] * self._skip + self._skip // 2, cells[:, 1] * self._skip + self._skip // 2]
 
-    def add_destinations(self, points: list[Vec2]) -> None:
-        """Compute the paths to these points; they get the next destination indices in order."""
-        if not points:
-            return
+    def set_destinations(self, points: list[Vec2]) -> None:
+        """Compute the paths to these points, which are addressed by their indices from now on."""
         goals = self.nodes_at(np.array([p[0] for p in points]), np.array([p[1] for p in points]))
         costs, onwards = dijkstra(self._graph, directed=False, indices=goals, return_predecessors=True)
         jumps = max(1, round(_AHEAD_M / self._coarse))
-        for goal, cost, nodes in zip(goals, costs, onwards, strict=True):
+        tables = []
+        for goal, nodes in zip(goals, onwards, strict=True):
             step = np.where(nodes < 0, np.arange(len(nodes)), nodes)
             step[goal] = goal
             ahead = step
             for _ in range(jumps - 1):
                 ahead = step[ahead]
-            self._ahead.append(ahead.astype(np.int32))
-            self._lengths.append(cost.astype(np.float32))
-        self._table, self._costs = np.stack(self._ahead), np.stack(self._lengths)
+            tables.append(ahead.astype(np.int32))
+        self._table = np.stack(tables)
+        self._costs: NDArray[np.float32] = costs.astype(np.float32)
         offset = (self._skip // 2 + 0.5) * self._fine
         self._x = self._origin[0] + self._cells[:, 1] * self._coarse + offset
         self._y = self._origin[1] + self._cells[:, 0] * self._coarse + offset

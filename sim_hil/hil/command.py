@@ -24,7 +24,8 @@ from edge.core.cli import (
     write_result,
 )
 from firmware_bridge.core.config import ConfigError
-from firmware_bridge.unitree.dds import DDS_ERRORS, DdsError
+from firmware_bridge.core.robot_state import DdsError
+from firmware_bridge.unitree.dds import DDS_ERRORS
 from sim_hil.hil.display import check_display
 from sim_hil.hil.loop import POSE_HZ, STEPS_PER_S, HilLoop
 from sim_hil.hil.trace import TraceWriter
@@ -54,8 +55,10 @@ EPILOG: Final = """examples:
   FAULT      drop, corrupt, duplicate, delay: probability per frame; delay_s (0.05); bus_off_every_s (0: never) and
              bus_off_s (0.2); babble_hz (0: none), babble_from_s and babble_s: a node that sends continuously
   default    serial:RUNTIME/carter-can in the user's runtime directory; the ready line names it
---link of mavlink: udp:HOST:PORT[,to=HOST:PORT...][,camera=PORT][,system=NUMBER][,key=FILE]
+--link of mavlink: udp:HOST:PORT[,to=HOST:PORT...][,camera=PORT][,system=NUMBER][,key=FILE][,IMPAIRMENT=NUMBER...]
   to         address that receives heartbeats unasked; key: file of a signing key, then unsigned packets are ignored
+  IMPAIRMENT of both directions: loss_percent, loss_burst (mean length), delay_ms, jitter_ms (standard deviation),
+             duplicate_percent, reorder_percent, reorder_ms (20)
   default    udp:127.0.0.1:14580,to=127.0.0.1:14540,to=127.0.0.1:14550
 camera: TCP port of the HTTP camera stream, default 8090
 

@@ -49,9 +49,11 @@ class HilLoop:
         """
         self._trace = trace
         scene = self._options.scene
+        solids = [(wall.label, "wall", wall.box) for wall in scene.walls]
+        solids += [(thing.label, thing.kind, thing.box) for thing in scene.objects]
         footprints = [
-            {"label": f.label, "kind": f.kind, "polygon": [list(map(float, corner)) for corner in f.polygon]}
-            for f in scene.footprints()
+            {"label": label, "kind": kind, "polygon": [list(map(float, corner)) for corner in box.corners()]}
+            for label, kind, box in solids
         ]
         start, goal = list(scene.start), list(scene.goal_xy)
         self._note("scene", name=scene.name, start=start, goal=goal, footprints=footprints)

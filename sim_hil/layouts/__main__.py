@@ -9,8 +9,7 @@ from pathlib import Path
 from edge.core.cli import check_result_target, command_line, write_named, write_result
 from sim_hil.layouts import BENCHMARK_SEEDS, KINDS, RESERVED_BELOW, LayoutError, generate
 from sim_hil.scene.map import draw_map
-from sim_hil.scene.scene import Scene
-from sim_hil.scene.writer import scene_to_toml
+from sim_hil.scene.scene import Scene, scene_to_toml
 from sim_hil.world.drawing.textures import png_bytes
 
 _EXAMPLES = f"""examples:
@@ -58,26 +57,21 @@ def main(argv: list[str] | None = None) -> int:
     if not args.benchmark and 0 <= args.seed < RESERVED_BELOW:
         sys.stderr.write(f"--seed: {args.seed} is the benchmark's; take {RESERVED_BELOW} or more, or --benchmark\n")
         return 2
+    seed = BENCHMARK_SEEDS[args.kind] if args.benchmark else args.seed
     try:
         check_result_target(args.json)
         for option, path in (("--out", args.out), ("--map", args.map)):
             check_result_target(None if path is None else str(path), option)
-    except OSError as error:
-        sys.stderr.write(f"{error}\n")
-        return 2
-    seed = BENCHMARK_SEEDS[args.kind] if args.benchmark else args.seed
-    try:
         scene = generate(args.kind, seed, reserved=args.benchmark)
-    except LayoutError as error:
-        sys.stderr.write(str(error) + "\n")
-        return 1 if seed >= 0 else 2
-    try:
         write_named(args.out, scene_to_toml(scene))
         if args.map is not None:
             write_named(args.map, png_bytes(draw_map(scene, args.px_per_m, names=True)))
         write_result(args.json, _summary(scene))
+    except LayoutError as error:
+        sys.stderr.write(f"{error}\n")
+        return 1 if seed >= 0 else 2
     except OSError as error:
-        sys.stderr.write(f"cannot write: {error}" + "\n")
+        sys.stderr.write(f"{error}\n")
         return 2
     return 0
 

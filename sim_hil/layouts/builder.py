@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from math import atan2, cos, degrees, hypot, pi, radians, sin
+from typing import Any, TypeVar
 
 import numpy as np
 
 from sim_hil.layouts.plan import WALL_THICKNESS_M, Border, LayoutError, Rect, Vec2, shared_border, wall_lines
 from sim_hil.scene.scene import KINDS, SKY, Area, Floor, Place, Scene, SceneObject, Terrain, Vec3, Wall
+
+Item = TypeVar("Item")
 
 # Named colours; an instruction may only use them for objects of exactly this colour.
 COLOURS: dict[str, Vec3] = {
@@ -74,6 +77,10 @@ class Builder:
         """Return a random item."""
         return choices[int(self.rng.integers(len(choices)))]
 
+    def shuffled(self, items: Sequence[Item]) -> list[Item]:
+        """Return the items in random order."""
+        return [items[int(i)] for i in self.rng.permutation(len(items))]
+
     def room(self, rect: Rect, kind: str, name: str, floor: str = "") -> Room:
         """Add a rectangle of the plan. Raises LayoutError if it overlaps another."""
         for other in self.rooms:
@@ -113,8 +120,12 @@ class Builder:
     def put(
         self, kind: str, x: float, y: float, heading_rad: float, *, z: float = 0.0, size: Vec3 | None = None,
         colour: str = "", landmark: str = "", text: str = "", label: str = "", gap_m: float = 0.1, force: bool = False,
+        seats: int = 0, queue: int = 0,
     ) -> SceneObject | None:  # fmt: skip
-        """Add an object; return None if it would collide. `force` skips that check."""
+        """Add an object; return None if it would collide, unless `force`.
+
+        `seats`: number of people who can sit on it; `queue`: number of people who can queue before it.
+        """
         size = size or KINDS[kind].size_m
         outline = outline_of(x, y, heading_rad, _STEMS.get(kind, size))
         overhead = kind in _OVERHEAD or kind in _LYING
@@ -127,12 +138,16 @@ class Builder:
         self.things.append(thing)
         if not overhead:
             self._taken.append(outline)
+        if seats:
+            self.place("sit", x, y, heading_rad, seats)
+        if queue:
+            self.place_before(thing, "queue", queue)
         return thing
 
     def against(
         self, room: Room, kind: str, *, side: str = "", along: float | None = None, size: Vec3 | None = None,
         colour: str = "", landmark: str = "", text: str = "", label: str = "", tries: int = 24, lone: bool = False,
-        margin_m: float = 0.25,
+        margin_m: float = 0.25, seats: int = 0, queue: int = 0,
     ) -> SceneObject | None:  # fmt: skip
         """Place an object with its back to one of the room's walls; return None if there is no free space.
 
@@ -159,7 +174,7 @@ class Builder:
                 continue
             thing = self.put(
                 kind, x, y, _FACING[where], z=_HUNG_M.get(kind, 0.0), size=size, colour=colour, landmark=landmark,
-                text=text, label=label,
+                text=text, label=label, seats=seats, queue=queue,
             )  # fmt: skip
             if thing is not None:
                 if lone and thing.solid:
@@ -210,14 +225,13 @@ class Builder:
         )  # fmt: skip
         patches = [Floor(room.rect.corners(), room.floor) for room in self.rooms if room.floor] + self.floors
         ceiling_m = self.ceiling_m if ceiling else 0.0
-        scene = Scene(
+        return Scene(
             name=name, start=start, goal_xy=goal, floor_min_m=(bounds.x0, bounds.y0),
             floor_max_m=(bounds.x1, bounds.y1), floor_texture=floor, ceiling_height_m=ceiling_m, walls=tuple(walls),
             objects=tuple(self.things), routes=(), floors=tuple(patches), terrain=tuple(self.terrain),
             areas=tuple(Area(room.label, room.kind, room.rect.corners(), room.name) for room in self.rooms),
             places=tuple(self.places), ceiling_texture=ceiling or "ceiling_panels", sky=sky,
         )  # fmt: skip
-        return scene
 
 
 def outline_of(x: float, y: float, heading_rad: float, size: Vec3) -> Rect:
@@ -256,50 +270,38 @@ def turned(scene: Scene, turn: Turn) -> Scene:
     x0, y0 = min(c[0] for c in corners), min(c[1] for c in corners)
     x1, y1 = max(c[0] for c in corners), max(c[1] for c in corners)
 
-    def at(p: Vec2) -> Vec2:
-        x, y = turn.point(p)
-        return (_mm(x - x0), _mm(y - y0))
+    def at(point: tuple[float, ...]) -> tuple[float, ...]:
+        x, y = turn.point((point[0], point[1]))
+        return (_mm(x - x0), _mm(y - y0), *(_mm(z) for z in point[2:]))
 
-    def round_(polygon: tuple[Vec2, ...]) -> tuple[Vec2, ...]:
-        moved = tuple(at(p) for p in polygon)
-        mirrored = (turn.swap + turn.flip_x + turn.flip_y) % 2 == 1
-        return tuple(reversed(moved)) if mirrored else moved
+    def outline(polygon: tuple[Vec2, ...]) -> tuple[tuple[float, ...], ...]:
+        moved = tuple(at(point) for point in polygon)
+        return moved[::-1] if (turn.swap + turn.flip_x + turn.flip_y) % 2 else moved
 
-    def at3(p: Vec3) -> Vec3:
-        return (*at((p[0], p[1])), _mm(p[2]))
+    changes: dict[str, Callable[[Any], Any]] = {
+        "start_m": at,
+        "end_m": at,
+        "position_m": at,
+        "heading_rad": turn.heading,
+        "size_m": lambda size: tuple(_mm(extent) for extent in size),
+        "polygon": outline,
+    }
 
-    def size(s: Vec3) -> Vec3:
-        return (_mm(s[0]), _mm(s[1]), _mm(s[2]))
+    def moved(parts: tuple[Any, ...]) -> tuple[Any, ...]:
+        keys = [key for key in changes if parts and hasattr(parts[0], key)]
+        return tuple(replace(part, **{key: changes[key](getattr(part, key)) for key in keys}) for part in parts)
 
-    return Scene(
-        name=scene.name,
-        start=(*at((scene.start[0], scene.start[1])), turn.heading(scene.start[2])),
-        goal_xy=at(scene.goal_xy),
+    sections = ("walls", "objects", "floors", "terrain", "areas", "places")
+    parts: dict[str, Any] = {name: moved(getattr(scene, name)) for name in sections}
+    start, goal = at(scene.start[:2]), at(scene.goal_xy)
+    return replace(
+        scene,
+        start=(start[0], start[1], turn.heading(scene.start[2])),
+        goal_xy=(goal[0], goal[1]),
         floor_min_m=(0.0, 0.0),
         floor_max_m=(_mm(x1 - x0), _mm(y1 - y0)),
-        floor_texture=scene.floor_texture,
-        ceiling_height_m=scene.ceiling_height_m,
-        walls=tuple(
-            Wall(w.label, at(w.start_m), at(w.end_m), w.thickness_m, w.height_m, w.texture) for w in scene.walls
-        ),
-        objects=tuple(
-            SceneObject(o.label, o.kind, at3(o.position_m), turn.heading(o.heading_rad), size(o.size_m), o.colour,
-                        o.text, o.landmark)
-            for o in scene.objects
-        ),
-        routes=(),
-        floors=tuple(Floor(round_(f.polygon), f.texture, turn.heading(f.heading_rad)) for f in scene.floors),
-        terrain=tuple(
-            Terrain(t.label, t.kind, at3(t.position_m), turn.heading(t.heading_rad), t.size_m, t.rise_m, t.texture)
-            for t in scene.terrain
-        ),
-        areas=tuple(Area(a.label, a.kind, round_(a.polygon), a.name) for a in scene.areas),
-        places=tuple(
-            Place(p.label, at(p.position_m), turn.heading(p.heading_rad), p.kind, p.capacity) for p in scene.places
-        ),
-        ceiling_texture=scene.ceiling_texture,
-        sky=scene.sky,
-    )  # fmt: skip
+        **parts,
+    )
 
 
 def _mm(value: float) -> float:

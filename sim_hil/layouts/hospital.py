@@ -8,9 +8,18 @@ from __future__ import annotations
 import numpy as np
 
 from sim_hil.layouts.builder import Builder, Room
-from sim_hil.layouts.furnish import corridor_ends, door, lights, named, outer_windows, sit_on, wide_opening
+from sim_hil.layouts.building import (
+    Bones,
+    Building,
+    along_corridors,
+    corridor_ends,
+    door,
+    finished,
+    named,
+    raise_bones,
+    wide_opening,
+)  # fmt: skip
 from sim_hil.layouts.plan import LayoutError, Rect
-from sim_hil.layouts.skeleton import Bones, Building, raise_bones
 from sim_hil.scene.scene import Scene
 
 _BONES = Bones(
@@ -31,13 +40,12 @@ def hospital(rng: np.random.Generator) -> Scene:
     """Generate a hospital. Raises LayoutError or SceneError if the random draw is not feasible."""
     builder = Builder("hospital", rng, "wall_hospital", 2.8)
     building = raise_bones(builder, _BONES)
-    bounds = Rect(0, 0, building.long[0].rect.x1, max(slot.y1 for slot, _ in building.slots))
-    slots = [building.slots[int(i)] for i in rng.permutation(len(building.slots))]
+    slots = builder.shuffled(building.slots)
     wide = sorted(slots, key=lambda slot: -slot[0].width)[:3]
     rest = [slot for slot in slots if slot not in wide]
     if len(rest) < 8:
         raise LayoutError("too few rooms")
-    colours = [_MACHINES[int(i)] for i in rng.permutation(len(_MACHINES))]
+    colours = builder.shuffled(_MACHINES)
 
     # Ends of corridors come first, so that their doors are in the middle of the wall.
     corridor_ends(building)
@@ -53,15 +61,7 @@ def hospital(rng: np.random.Generator) -> Scene:
         door(builder, room, corridor, _BONES.door_m, _colour_of(name), f"{_short(name)} {101 + number}")
         _furnish(builder, room, name)
     _along_corridors(building, colours[1:])
-    outer_windows(builder, bounds, rooms)
-    lights(builder)
-    for room in rooms:
-        builder.stand_in(room.rect, 1)
-    for corridor in building.long + building.cross + building.stubs:
-        builder.stand_in(corridor.rect, max(1, round(max(corridor.rect.width, corridor.rect.depth) / 5)))
-    south = building.long[0].rect
-    start = (south.x0 + 2.0, south.centre[1], 0.0)
-    return builder.scene("hospital", start, (south.x1 - 2.5, south.centre[1]), floor="vinyl")
+    return finished(building, "hospital", rooms)
 
 
 def _floor_of(name: str) -> str:
@@ -97,14 +97,11 @@ def _waiting(builder: Builder, slot: Rect, corridor: Room) -> None:
     wide_opening(builder, room, corridor, 3.4, "green", "WAITING")
     colour = builder.pick(("red", "orange", "green", "yellow"))
     back = "n" if corridor.rect.y0 < slot.y0 else "s"
-    sofa = builder.against(room, "sofa", side=back, along=0.5, colour=colour, landmark=named("sofa", colour))
-    if sofa is not None:
-        sit_on(builder, sofa, 2)
+    builder.against(room, "sofa", side=back, along=0.5, colour=colour, landmark=named("sofa", colour),
+                    seats=2)  # fmt: skip
     for wall in ("w", "e"):
         for share in (0.3, 0.62):
-            chair = builder.against(room, "chair", side=wall, along=share)
-            if chair is not None:
-                sit_on(builder, chair, 1)
+            builder.against(room, "chair", side=wall, along=share, seats=1)
     builder.against(room, "screen", side=back)
     builder.stand_in(slot, 2)
 
@@ -118,12 +115,9 @@ def _service(builder: Builder, slot: Rect, corridor: Room, colour: str) -> None:
     if machine is None:
         raise LayoutError("no room for the vending machine")
     builder.place_before(machine, "queue", 3)
-    water = builder.against(room, "water_dispenser", side=back, landmark=named("water_dispenser"))
-    if water is not None:
-        builder.place_before(water, "queue", 2)
-    coffee = builder.against(room, "coffee_machine", side=builder.pick(("w", "e")), landmark=named("coffee_machine"))
-    if coffee is not None:
-        builder.place_before(coffee, "queue", 2)
+    builder.against(room, "water_dispenser", side=back, landmark=named("water_dispenser"), queue=2)
+    side = builder.pick(("w", "e"))
+    builder.against(room, "coffee_machine", side=side, landmark=named("coffee_machine"), queue=2)
     builder.against(room, "trash_bin", landmark=named("trash_bin"))
 
 
@@ -138,9 +132,7 @@ def _furnish(builder: Builder, room: Room, name: str) -> None:
         extra = builder.pick(("iv_stand", "medical_monitor", "privacy_screen", "wheelchair"))
         builder.against(room, extra)
         builder.against(room, "cabinet", colour=builder.pick(("white", "blue", "green", "brown")))
-        chair = builder.against(room, "chair")
-        if chair is not None:
-            sit_on(builder, chair, 1)
+        builder.against(room, "chair", seats=1)
         builder.against(room, builder.pick(("painting", "screen", "clock")))
     elif name == "nurse room":
         builder.against(room, "desk", landmark=named("desk"), tries=40)
@@ -161,7 +153,6 @@ def _furnish(builder: Builder, room: Room, name: str) -> None:
 
 
 def _along_corridors(building: Building, colours: list[str]) -> None:
-    """Add single objects along the corridors, so that a robot and a person can still pass each other."""
     builder = building.builder
     machine = builder.against(
         building.long[int(builder.rng.integers(2))], "vending_machine", side=builder.pick(("n", "s")), tries=60,
@@ -169,23 +160,6 @@ def _along_corridors(building: Building, colours: list[str]) -> None:
     )  # fmt: skip
     if machine is not None:
         builder.place_before(machine, "queue", 2, gap_m=0.5)
-    for corridor in [*building.long, *building.cross]:
-        walls = ("n", "s") if corridor in building.long else ("w", "e")
-        length = max(corridor.rect.width, corridor.rect.depth)
-        wanted = ["water_dispenser", "bench", "plant", "medical_cart", "fire_extinguisher", "wheelchair", "trash_bin"]
-        wanted = [wanted[int(i)] for i in builder.rng.permutation(len(wanted))]
-        for kind in wanted[: 5 if length > 20 else 2]:
-            colour = builder.pick(("blue", "red", "green", "orange")) if kind == "bench" else ""
-            size = (0.9, 0.65, 0.92) if kind == "wheelchair" else None
-            thing = builder.against(corridor, kind, side=builder.pick(walls), colour=colour, size=size,
-                                    landmark=named(kind, colour), lone=True)  # fmt: skip
-            if thing is None:
-                continue
-            if kind == "bench":
-                sit_on(builder, thing, 2)
-            elif kind == "water_dispenser":
-                builder.place_before(thing, "queue", 2)
-        for _ in range(round(length / 9)):
-            kind = builder.pick(("notice_board", "painting", "painting", "clock"))
-            builder.against(corridor, kind, side=builder.pick(walls), text="NOTICES" if kind == "notice_board" else "",
-                            landmark=named(kind) if kind == "notice_board" else "")  # fmt: skip
+    kinds = ("water_dispenser", "bench", "plant", "medical_cart", "fire_extinguisher", "wheelchair", "trash_bin")
+    hung = ("notice_board", "painting", "painting", "clock")
+    along_corridors(building, kinds, hung, 9.0, coloured=("bench",))

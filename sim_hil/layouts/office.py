@@ -10,9 +10,18 @@ from math import pi
 import numpy as np
 
 from sim_hil.layouts.builder import Builder, Room
-from sim_hil.layouts.furnish import corridor_ends, door, lights, lintel, named, outer_windows, sit_on, wide_opening
+from sim_hil.layouts.building import (
+    Bones,
+    along_corridors,
+    corridor_ends,
+    door,
+    finished,
+    lintel,
+    named,
+    raise_bones,
+    wide_opening,
+)  # fmt: skip
 from sim_hil.layouts.plan import LayoutError, Rect, shared_border
-from sim_hil.layouts.skeleton import Bones, Building, raise_bones
 from sim_hil.scene.scene import Scene
 
 _BONES = Bones(
@@ -38,16 +47,15 @@ def office(rng: np.random.Generator) -> Scene:
     """Generate an office floor. Raises LayoutError or SceneError if the random draw is not feasible."""
     builder = Builder("office", rng, "wall_office", 2.7)
     building = raise_bones(builder, _BONES)
-    bounds = Rect(0, 0, building.long[0].rect.x1, max(slot.y1 for slot, _ in building.slots))
     corridor_ends(building, "door")
     slots = sorted(building.slots, key=lambda slot: (slot[0].y0, slot[0].x0))
     slots, hall = _merged(builder, slots)
     rooms = [_open_floor(builder, *hall)]
-    order = [slots[int(i)] for i in rng.permutation(len(slots))]
+    order = builder.shuffled(slots)
     if len(order) < 9:
         raise LayoutError("too few rooms")
     _elevators(builder, *order.pop())
-    carpets = [_CARPETS[int(i)] for i in rng.permutation(len(_CARPETS))]
+    carpets = builder.shuffled(_CARPETS)
     for number, (slot, corridor) in enumerate(sorted(order, key=lambda s: (s[0].y0, s[0].x0))):
         # First one of each kind, so that every office has a kitchen and a lounge; then random ones.
         name = _NAMES[number] if number < len(_NAMES) else builder.pick(_NAMES)
@@ -58,16 +66,10 @@ def office(rng: np.random.Generator) -> Scene:
     _connect(builder, rooms)
     for room in rooms[1:]:
         _furnish(builder, room, carpets)
-    _along_corridors(building)
-    outer_windows(builder, bounds, rooms)
-    lights(builder)
-    for room in rooms:
-        builder.stand_in(room.rect, 1)
-    for corridor in building.long + building.cross + building.stubs:
-        builder.stand_in(corridor.rect, max(1, round(max(corridor.rect.width, corridor.rect.depth) / 5)))
-    south = building.long[0].rect
-    start = (south.x0 + 2.0, south.centre[1], 0.0)
-    return builder.scene("office", start, (south.x1 - 2.5, south.centre[1]), floor="carpet_tiles")
+    kinds = ("water_dispenser", "bench", "plant", "fire_extinguisher", "trash_bin", "cabinet", "wet_floor_sign")
+    hung = ("notice_board", "painting", "painting", "screen")
+    along_corridors(building, kinds, hung, 7.0, coloured=("bench", "cabinet", "painting"))
+    return finished(building, "office", rooms)
 
 
 def _merged(
@@ -161,12 +163,8 @@ def _furnish(builder: Builder, room: Room, carpets: list[str]) -> None:
         builder.put("carpet", *middle, 0.0, size=(min(2.4, room.rect.width - 1.6), 2.0, 0.01), colour=colour,
                     landmark=named("carpet", colour))  # fmt: skip
         colour = builder.pick(("red", "green", "yellow", "blue"))
-        sofa = builder.against(room, "sofa", colour=colour, landmark=named("sofa", colour), tries=40)
-        if sofa is not None:
-            sit_on(builder, sofa, 2)
-        chair = builder.against(room, "armchair", colour=builder.pick(("orange", "green", "purple")))
-        if chair is not None:
-            sit_on(builder, chair, 1)
+        builder.against(room, "sofa", colour=colour, landmark=named("sofa", colour), tries=40, seats=2)
+        builder.against(room, "armchair", colour=builder.pick(("orange", "green", "purple")), seats=1)
         builder.against(room, "painting")
     elif room.name == "print room":
         builder.against(room, "printer", landmark=named("printer"), tries=40)
@@ -175,34 +173,9 @@ def _furnish(builder: Builder, room: Room, carpets: list[str]) -> None:
         builder.against(room, "cabinet", colour="grey")
     else:
         colour = builder.pick(("red", "blue", "green", "yellow"))
-        machine = builder.against(room, "vending_machine", colour=colour, text="SNACKS", tries=40,
-                                  landmark=named("vending_machine", colour))  # fmt: skip
-        fridge = builder.against(room, "refrigerator", landmark=named("refrigerator"))
-        coffee = builder.against(room, "coffee_machine", landmark=named("coffee_machine"), tries=40)
-        for thing in (machine, fridge, coffee):
-            if thing is not None:
-                builder.place_before(thing, "queue", 2)
+        builder.against(room, "vending_machine", colour=colour, text="SNACKS", tries=40, queue=2,
+                        landmark=named("vending_machine", colour))  # fmt: skip
+        builder.against(room, "refrigerator", landmark=named("refrigerator"), queue=2)
+        builder.against(room, "coffee_machine", landmark=named("coffee_machine"), tries=40, queue=2)
         builder.against(room, "table")
         builder.against(room, "trash_bin")
-
-
-def _along_corridors(building: Building) -> None:
-    builder = building.builder
-    for corridor in [*building.long, *building.cross]:
-        walls = ("n", "s") if corridor in building.long else ("w", "e")
-        length = max(corridor.rect.width, corridor.rect.depth)
-        wanted = ["water_dispenser", "bench", "plant", "fire_extinguisher", "trash_bin", "cabinet", "wet_floor_sign"]
-        wanted = [wanted[int(i)] for i in builder.rng.permutation(len(wanted))]
-        for kind in wanted[: 5 if length > 20 else 2]:
-            colour = builder.pick(("blue", "red", "green", "orange")) if kind in ("bench", "cabinet") else ""
-            thing = builder.against(corridor, kind, side=builder.pick(walls), colour=colour,
-                                    landmark=named(kind, colour), lone=True)  # fmt: skip
-            if thing is not None and kind == "bench":
-                sit_on(builder, thing, 2)
-            elif thing is not None and kind == "water_dispenser":
-                builder.place_before(thing, "queue", 2)
-        for _ in range(round(length / 7)):
-            kind = builder.pick(("notice_board", "painting", "painting", "screen"))
-            colour = builder.pick(("red", "blue", "green", "yellow")) if kind == "painting" else ""
-            builder.against(corridor, kind, side=builder.pick(walls), text="NOTICES" if kind == "notice_board" else "",
-                            colour=colour, landmark=named(kind, "") if kind == "notice_board" else "")  # fmt: skip

@@ -54,10 +54,6 @@ class Rect:
         apart_y = self.y1 <= other.y0 + _EPS or other.y1 <= self.y0 + _EPS
         return not (apart_x or apart_y)
 
-    def holds(self, x: float, y: float) -> bool:
-        """Return whether a point lies inside."""
-        return self.x0 <= x <= self.x1 and self.y0 <= y <= self.y1
-
     def corners(self) -> tuple[Vec2, ...]:
         """Return the corners, counter-clockwise."""
         return ((self.x0, self.y0), (self.x1, self.y0), (self.x1, self.y1), (self.x0, self.y1))

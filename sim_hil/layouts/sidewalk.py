@@ -5,14 +5,13 @@ Paper appendix C: "uneven terrain, ramps, streets, and large open spaces … umb
 
 from __future__ import annotations
 
-from math import pi
+from math import atan2, cos, hypot, pi, radians, sin, tan
 
 import numpy as np
 
 from sim_hil.layouts.builder import Builder, Room
-from sim_hil.layouts.furnish import named, sit_on
+from sim_hil.layouts.building import named
 from sim_hil.layouts.plan import LayoutError, Rect
-from sim_hil.layouts.square import park, plaza
 from sim_hil.scene.scene import Floor, Scene, SceneObject, Terrain
 
 _SHOPS = ("BAKERY", "CAFE", "BOOKS", "FLOWERS", "PIZZA", "TOYS", "BANK", "SHOES", "MUSIC", "BIKES")
@@ -20,6 +19,9 @@ _SHOP_COLOURS = ("red", "blue", "green", "yellow", "orange", "purple", "white", 
 _BRICKS = ((0.70, 0.42, 0.32), (0.78, 0.70, 0.58), (0.56, 0.58, 0.62), (0.62, 0.50, 0.40), (0.72, 0.62, 0.52))
 _KERB_M = (0.25, 0.14)  # width, height; too high for a robot
 _BUMP_M = 0.04
+_PARASOLS = ("red", "blue", "yellow", "green", "orange", "purple")
+_RISE_M = 0.3
+_RAMP_RAD = radians(7.0)
 
 
 def sidewalk(rng: np.random.Generator) -> Scene:
@@ -35,7 +37,7 @@ def sidewalk(rng: np.random.Generator) -> Scene:
 
     crossings = _streets(builder, length, depth, (x0, y0, x1, y1), walk, zebra)
     strips = _sidewalks(builder, length, depth, (x0, y0, x1, y1), walk)
-    _kerbs(builder, strips, crossings, (x0, y0, x1, y1), length, depth)
+    _kerbs(builder, crossings, (x0, y0, x1, y1), length, depth)
     lots = [
         Rect(0, 0, x0 - walk, y0 - walk), Rect(x1 + walk, 0, length, y0 - walk),
         Rect(0, y1 + walk, x0 - walk, depth), Rect(x1 + walk, y1 + walk, length, depth),
@@ -48,17 +50,17 @@ def sidewalk(rng: np.random.Generator) -> Scene:
             parts += [(Rect(lot.x0, lot.y0, cut, lot.y1), north), (Rect(cut, lot.y0, lot.x1, lot.y1), north)]
         else:
             parts.append((lot, north))
-    order = [parts[int(i)] for i in rng.permutation(len(parts))]
+    order = builder.shuffled(parts)
     open_parts = [part for part in order if part[0].width >= 18.0 and part[0].depth >= 18.0]
     if len(open_parts) < 2:
         raise LayoutError("no room for a plaza and a park")
-    plaza(builder, *open_parts[0])
-    park(builder, *open_parts[1])
-    colours = [_SHOP_COLOURS[int(i)] for i in rng.permutation(len(_SHOP_COLOURS))]
-    words = [_SHOPS[int(i)] for i in rng.permutation(len(_SHOPS))]
+    _plaza(builder, *open_parts[0])
+    _park(builder, *open_parts[1])
+    colours = builder.shuffled(_SHOP_COLOURS)
+    names = builder.shuffled(_SHOPS)
     for part in order:
         if part not in open_parts[:2]:
-            _buildings(builder, *part, colours, words, x_street=(x0 + x1) / 2)
+            _buildings(builder, *part, colours, names)
     _furniture(builder, strips, (x0, y0, x1, y1))
     _bumps(builder, strips)
     for strip in strips:
@@ -130,9 +132,8 @@ def _sidewalks(
 
 
 def _kerbs(
-    builder: Builder, strips: list[Room], crossings: list[Room], road: tuple[float, float, float, float],
-    length: float, depth: float,
-) -> None:  # fmt: skip
+    builder: Builder, crossings: list[Room], road: tuple[float, float, float, float], length: float, depth: float
+) -> None:
     """Add kerb stones along every edge between sidewalk and street; they are lowered at crossings."""
     x0, y0, x1, y1 = road
     width, rise = _KERB_M
@@ -160,12 +161,11 @@ def _kerbs(
                         (round(b - a, 3), width), rise, "kerb_stone")
             )  # fmt: skip
     for crossing in crossings:
-        rect = crossing.rect.grown(0.6)
-        builder.keep_clear(Rect(rect.x0 - 1.5, rect.y0 - 1.5, rect.x1 + 1.5, rect.y1 + 1.5))
+        builder.keep_clear(crossing.rect.grown(2.1))
 
 
 def _buildings(
-    builder: Builder, lot: Rect, north: bool, colours: list[str], words: list[str], x_street: float
+    builder: Builder, lot: Rect, north: bool, colours: list[str], names: list[str]
 ) -> None:  # fmt: skip
     """Fill a lot with a row of houses, each with a shop towards the main street."""
     count = max(1, round(lot.width / float(builder.rng.uniform(9.0, 13.0))))
@@ -184,7 +184,7 @@ def _buildings(
         )  # fmt: skip
         builder.things.append(thing)
         colour = colours.pop() if colours else ""
-        text = words.pop() if words else "SHOP"
+        text = names.pop() if names else "SHOP"
         sy = front + (1 if north else -1) * shop_depth / 2
         shop = builder.put(
             "storefront", x, sy, heading, size=(shop_depth, min(width - 0.4, 8.0), 4.2), colour=colour or "grey",
@@ -207,10 +207,10 @@ def _furniture(builder: Builder, strips: list[Room], road: tuple[float, float, f
         else:
             kerb_y = rect.x1 - 0.85 if rect.x1 <= x0 + 1e-6 else rect.x0 + 0.85
             facing = pi if rect.x1 <= x0 + 1e-6 else 0.0
-        wanted = ["tree", "lamp_post", "park_bench", "tree", "trash_bin", "mailbox", "bicycle_rack", "sign_post",
-                  "planter", "lamp_post"]  # fmt: skip
-        wanted = [wanted[int(i)] for i in builder.rng.permutation(len(wanted))]
-        if number == int(builder.rng.integers(4)) or (number == 3 and not _has(builder, "bus_stop")):
+        wanted = builder.shuffled(("tree", "lamp_post", "park_bench", "tree", "trash_bin", "mailbox", "bicycle_rack",
+                                   "sign_post", "planter", "lamp_post"))  # fmt: skip
+        has_stop = any(thing.kind == "bus_stop" for thing in builder.things)
+        if number == int(builder.rng.integers(4)) or (number == 3 and not has_stop):
             wanted.insert(0, "bus_stop")
         u, index = low + 2.0, 0
         while u < high - 2.0:
@@ -221,28 +221,21 @@ def _furniture(builder: Builder, strips: list[Room], road: tuple[float, float, f
                 kind, named_kind = "tree", False
             x, y = (u, kerb_y) if along_x else (kerb_y, u)
             size = {"bus_stop": (1.0, 3.0, 2.5), "bicycle_rack": (1.0, 1.8, 1.05)}.get(kind)
-            thing = builder.put(kind, x, y, facing, size=size, landmark=named(kind) if named_kind else "", gap_m=0.4,
-                                text="BUS" if kind == "bus_stop" else "")  # fmt: skip
-            if thing is not None and kind == "park_bench":
-                sit_on(builder, thing, 2)
-            elif thing is not None and kind == "bus_stop":
+            thing = builder.put(
+                kind, x, y, facing, size=size, landmark=named(kind) if named_kind else "", gap_m=0.4,
+                text="BUS" if kind == "bus_stop" else "", seats=2 if kind == "park_bench" else 0,
+            )  # fmt: skip
+            if thing is not None and kind == "bus_stop":
                 builder.place_before(thing, "queue", 5, gap_m=0.7)
             u += float(builder.rng.uniform(4.0, 6.5))
     colours = ("red", "blue", "white", "black", "grey", "green")
+    length = max(strip.rect.x1 for strip in strips)
     for lane_y, heading in ((y0 + 1.3, 0.0), (y1 - 1.3, pi)):
         for _ in range(14):
-            x = float(builder.rng.uniform(4.0, _length(strips) - 4.0))
+            x = float(builder.rng.uniform(4.0, length - 4.0))
             if not x0 - 12 < x < x1 + 12:
                 builder.put("car", x, lane_y, heading, colour=builder.pick(colours), gap_m=0.35)
     builder.put("car", x0 + 1.3, float(builder.rng.uniform(4.0, 12.0)), -pi / 2, colour=builder.pick(colours))
-
-
-def _has(builder: Builder, kind: str) -> bool:
-    return any(thing.kind == kind for thing in builder.things)
-
-
-def _length(strips: list[Room]) -> float:
-    return max(strip.rect.x1 for strip in strips)
 
 
 def _bumps(builder: Builder, strips: list[Room]) -> None:
@@ -257,3 +250,107 @@ def _bumps(builder: Builder, strips: list[Room]) -> None:
                     f"bump {builder.number('bump')}", "bump", (x, rect.centre[1], 0.0), 0.0, size, _BUMP_M, "cobbles"
                 )
             )
+
+
+def _plaza(builder: Builder, lot: Rect, north: bool) -> None:
+    """Add a paved plaza, open to the sidewalk, with a hedge on the far side."""
+    builder.room(lot, "plaza", "plaza", "cobbles")
+    rng = builder.rng
+    cx, cy = lot.centre
+    fx, fy = cx + float(rng.uniform(-0.12, 0.12)) * lot.width, cy + float(rng.uniform(-0.1, 0.1)) * lot.depth
+    fountain = builder.put("fountain", fx, fy, 0.0, landmark=named("fountain"), label="fountain")
+    if fountain is None:
+        raise LayoutError("no room for the fountain")
+    for index in range(6):
+        angle = 2 * pi * index / 6
+        reach = 3.2
+        builder.place("stand", fx + reach * cos(angle), fy + reach * sin(angle), angle + pi, 3)
+    for index in range(4):
+        angle = pi / 4 + pi / 2 * index
+        x, y = fx + 4.6 * cos(angle), fy + 4.6 * sin(angle)
+        builder.put("park_bench", x, y, atan2(fy - y, fx - x), gap_m=0.4, seats=2)
+    _terrace(builder, lot, (fx, fy))
+    colours = builder.shuffled(_PARASOLS)
+    for index in range(7):
+        single = index < 4
+        kind = "umbrella" if single else "umbrella_table"
+        colour = colours[index] if index < len(colours) else "white"
+        for _ in range(40):
+            x = float(rng.uniform(lot.x0 + 2.5, lot.x1 - 2.5))
+            y = float(rng.uniform(lot.y0 + 2.5, lot.y1 - 2.5))
+            if hypot(x - fx, y - fy) < 6.0:
+                continue
+            thing = builder.put(kind, x, y, 0.0, colour=colour, gap_m=0.9, landmark=f"{colour} umbrella")
+            if thing is not None:
+                for angle in (0.0, pi / 2, pi, -pi / 2):
+                    builder.place("stand", x + 1.6 * cos(angle), y + 1.6 * sin(angle), angle + pi, 1)
+                break
+    _somewhere(builder, lot, "kiosk", 1, 1.5, landmark=True)
+    if builder.things[-1].kind != "kiosk":
+        raise LayoutError("no room for the kiosk")
+    _somewhere(builder, lot, "planter", 3, 1.2)
+    _somewhere(builder, lot, "tree", 4, 0.6)
+    _edge(builder, lot, north)
+    builder.stand_in(lot, 10)
+
+
+def _terrace(builder: Builder, lot: Rect, avoid: tuple[float, float]) -> None:
+    """Add a raised platform with a ramp at each end."""
+    rng = builder.rng
+    size = (round(float(rng.uniform(4.0, 5.5)), 2), round(float(rng.uniform(3.2, 4.4)), 2))
+    run = round(_RISE_M / tan(_RAMP_RAD), 2)
+    for _ in range(60):
+        x = float(rng.uniform(lot.x0 + 1 + run + size[0] / 2, lot.x1 - 1 - run - size[0] / 2))
+        y = float(rng.uniform(lot.y0 + 2 + size[1] / 2, lot.y1 - 2 - size[1] / 2))
+        zone = Rect(
+            x - size[0] / 2 - run - 1.2, y - size[1] / 2 - 0.8, x + size[0] / 2 + run + 1.2, y + size[1] / 2 + 0.8
+        )
+        if builder.fits(zone, True) and hypot(x - avoid[0], y - avoid[1]) > 7.0:
+            break
+    else:
+        return
+    builder.keep_clear(zone)
+    builder.terrain.append(Terrain("terrace", "platform", (x, y, 0.0), 0.0, size, _RISE_M, "paving"))
+    for name, side, heading in (("west", -1, 0.0), ("east", 1, pi)):
+        at = (round(x + side * (size[0] / 2 + run / 2), 3), y, 0.0)
+        builder.terrain.append(
+            Terrain(f"{name} ramp", "ramp", at, heading, (run, round(size[1] * 0.7, 2)), _RISE_M, "concrete")
+        )
+
+
+def _park(builder: Builder, lot: Rect, north: bool) -> None:
+    """Add a park with grass, a paved path from the sidewalk, trees, benches and a statue."""
+    builder.room(lot, "plaza", "park", "grass")
+    cx, cy = lot.centre
+    statue = builder.put("statue", cx, cy, pi / 2 if not north else -pi / 2, landmark=named("statue"), label="statue")
+    if statue is None:
+        raise LayoutError("no room for the statue")
+    for angle in (0.0, 2.1, 4.2):
+        builder.place("stand", cx + 1.9 * cos(angle), cy + 1.9 * sin(angle), angle + pi, 3)
+    _somewhere(builder, lot, "park_bench", 4, 1.2)
+    _somewhere(builder, lot, "tree", 10, 0.8)
+    _edge(builder, lot, north)
+    builder.stand_in(lot, 8)
+
+
+def _somewhere(builder: Builder, lot: Rect, kind: str, count: int, gap_m: float, landmark: bool = False) -> None:
+    for _ in range(count):
+        for _ in range(30):
+            x = float(builder.rng.uniform(lot.x0 + 2.0, lot.x1 - 2.0))
+            y = float(builder.rng.uniform(lot.y0 + 2.0, lot.y1 - 2.0))
+            heading = float(builder.rng.choice([0.0, pi / 2, pi, -pi / 2]))
+            thing = builder.put(kind, x, y, heading, gap_m=gap_m, landmark=named(kind) if landmark else "",
+                                seats=2 if kind == "park_bench" else 0)  # fmt: skip
+            if thing is not None:
+                if kind == "kiosk":
+                    builder.place_before(thing, "queue", 4, gap_m=0.7)
+                break
+
+
+def _edge(builder: Builder, lot: Rect, north: bool) -> None:
+    """Add a hedge along the side away from the street, where the scene ends."""
+    y = lot.y1 - 0.5 if north else lot.y0 + 0.5
+    count = int(lot.width // 3.2)
+    for index in range(count):
+        x = lot.x0 + (index + 0.5) * lot.width / count
+        builder.put("hedge", x, y, pi / 2, size=(0.7, 3.0, 1.4), gap_m=0.0)

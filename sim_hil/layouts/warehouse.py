@@ -10,7 +10,7 @@ from math import pi
 import numpy as np
 
 from sim_hil.layouts.builder import Builder, Room
-from sim_hil.layouts.furnish import lights, named
+from sim_hil.layouts.building import lights, named
 from sim_hil.layouts.plan import Rect
 from sim_hil.scene.scene import Scene, Wall
 
@@ -56,7 +56,7 @@ def warehouse(rng: np.random.Generator) -> Scene:
     else:
         y += _MARGIN_M
 
-    made = _racks(builder, blocks, cross, aisles, width, block, bay)
+    made = _racks(builder, blocks, aisles, width, block, bay)
     _loading(builder, yard)
     _things(builder, main, made)
     lights(builder, 8.0)
@@ -76,11 +76,10 @@ def _hall(builder: Builder, bounds: Rect) -> list[Wall]:
 
 
 def _racks(
-    builder: Builder, blocks: list[tuple[float, float]], cross: list[Room], aisles: int, width: float, block: float,
-    bay: float,
-) -> list[Room]:  # fmt: skip
+    builder: Builder, blocks: list[tuple[float, float]], aisles: int, width: float, block: float, bay: float
+) -> list[Room]:
     """Add rows of racks, back to back between aisles, with one colour per block, and the aisles."""
-    colours = [_RACK_COLOURS[int(i)] for i in builder.rng.permutation(len(_RACK_COLOURS))]
+    colours = builder.shuffled(_RACK_COLOURS)
     made = []
     for y0, y1 in blocks:
         count = round((y1 - y0) / bay)
@@ -136,12 +135,13 @@ def _things(builder: Builder, main: Room, aisles: list[Room]) -> None:
     """Add objects that distinguish the aisles: cones, extinguishers, barriers, pallets, a pallet jack."""
     for side in ("w", "e"):
         builder.against(main, "fire_extinguisher", side=side, landmark=named("fire_extinguisher"))
-    kinds = ["traffic_cone", "box_stack", "pallet_jack", "drum", "fire_extinguisher", "wet_floor_sign"]
-    kinds = [kinds[int(i)] for i in builder.rng.permutation(len(kinds))]
+    kinds = builder.shuffled(
+        ("traffic_cone", "box_stack", "pallet_jack", "drum", "fire_extinguisher", "wet_floor_sign")
+    )
     starts = sorted({room.rect.y0 for room in aisles})
     for row, y0 in enumerate(starts):
         rooms = [room for room in aisles if room.rect.y0 == y0]
-        order = [rooms[int(i)] for i in builder.rng.permutation(len(rooms))]
+        order = builder.shuffled(rooms)
         # Each kind occurs once per row of aisles, and at most once along the whole length of an aisle.
         for index, room in enumerate(rooms if row else order):
             kind = kinds[(index + 2 * row) % len(kinds)] if row == 0 else _other(builder, kinds, room)

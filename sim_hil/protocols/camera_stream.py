@@ -20,18 +20,14 @@ from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final, TextIO
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
-
 from sim_hil.processes.child_process import Message, input_is_open, take_standard_output, write_message
-from sim_hil.protocols.render_process import RenderProcess
+from sim_hil.protocols.front_end import FrontEndOptions
+from sim_hil.protocols.render_process import RenderProcess, encode_jpeg
 from sim_hil.protocols.snapshot import SnapshotReader, TornSnapshotError
 from sim_hil.scene.scene import load_scene
 from sim_hil.simulation.camera import CameraWorld
 from sim_hil.simulation.sensor_noise import SensorNoise
 
-JPEG_QUALITY: Final = 85
 RATE_HZ: Final = 15.0
 _BOUNDARY: Final = "frame"
 _IDLE_S: Final = 0.05
@@ -157,29 +153,15 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 class CameraStream(RenderProcess):
-    """Starts the camera process, hands it the pose, counts its pictures. It ends when this object or process does."""
+    """Camera process with an HTTP server; counts its pictures."""
 
-    def __init__(
-        self,
-        scene: str,
-        *,
-        robot: str,
-        people: int,
-        seed: int,
-        size: tuple[int, int],
-        port: int,
-        state_length: int,
-    ) -> None:
-        """Start the process. `scene`: name or file for load_scene; `size`: (width, height), px; `port`: 0 for any free
-        port; `state_length`: length of a render state. Raises OSError if the port is in use.
-        """
+    def __init__(self, options: FrontEndOptions, port: int, state_length: int) -> None:
+        """Start the process; `port`: 0 for any free port. Raises OSError if the port is in use."""
         # The parent opens the socket, so that a port in use is reported at once and a free port is known.
         with listen(port) as listening:
             self.port = int(listening.getsockname()[1])
-            command = [sys.executable, "-m", "sim_hil.protocols.camera_stream", "--scene", scene, "--robot", robot]
-            command += ["--people", str(people), "--seed", str(seed), "--width", str(size[0]), "--height", str(size[1])]
-            command += ["--listen-fd", str(listening.fileno())]
-            super().__init__(command, state_length, (listening.fileno(),))
+            more = ["--robot", options.robot, "--listen-fd", str(listening.fileno())]
+            super().__init__("sim_hil.protocols.camera_stream", options, more, state_length, (listening.fileno(),))
         self.pictures = 0
 
     @property
@@ -192,13 +174,6 @@ class CameraStream(RenderProcess):
         events = super().events()
         self.pictures += sum(event["event"] == "picture" for event in events)
         return events
-
-
-def _jpeg(rgb: NDArray[np.uint8]) -> bytes:
-    done, data = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    if not done:
-        raise RuntimeError("OpenCV could not encode a camera frame as JPEG")
-    return data.tobytes()
 
 
 def _render_while_parent_lives(
@@ -219,7 +194,7 @@ def _render_while_parent_lives(
             sys.stderr.write(f"edge-hil camera: image skipped: {error}\n")
             continue
         if state is not None:
-            shutter.show(captured_ns, _jpeg(noise.add(world.render(state, *size))))
+            shutter.show(captured_ns, encode_jpeg(noise.add(world.render(state, *size))))
             write_message(pipe, {"event": "picture"})
 
 

@@ -1,31 +1,48 @@
-"""The parent's handle on a camera process: the pose goes there through shared memory, its events come back as lines."""
+"""Parent's side of a camera process: it gets the pose through shared memory and sends events as lines."""
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Sequence
 from typing import Final
 
-from numpy import float64
+import cv2
+import numpy as np
 from numpy.typing import NDArray
 
 from sim_hil.processes.child_process import ChildProcess, Message, parse_message
+from sim_hil.protocols.front_end import FrontEndOptions
 from sim_hil.protocols.snapshot import SnapshotWriter
 
 _START_TIMEOUT_S: Final = 60.0
 _END_TIMEOUT_S: Final = 3.0
 _POLL_S: Final = 0.02
+JPEG_QUALITY: Final = 85
 
 
 class CameraProcessError(RuntimeError):
-    """The camera process did not start, has died, or sent a line that is no event."""
+    """The camera process did not start, died, or sent an invalid event."""
 
 
 class RenderProcess:
-    """A process that renders the newest pose; it ends when this object or the parent process does."""
+    """Process that renders the newest pose; it ends with this object and with the parent process."""
 
-    def __init__(self, command: Sequence[str], state_length: int, pass_fds: Sequence[int] = ()) -> None:
-        """`state_length`: numbers in a render state. Raises OSError when the process cannot be started."""
+    def __init__(
+        self,
+        module: str,
+        options: FrontEndOptions,
+        more: Sequence[str],
+        state_length: int,
+        pass_fds: Sequence[int] = (),
+    ) -> None:
+        """Start `module` with the options' scene, people, seed and camera size, and the arguments `more`.
+
+        `state_length`: length of a render state. Raises OSError if the process cannot be started.
+        """
+        width, height = options.camera_size or (0, 0)
+        command = [sys.executable, "-m", module, "--scene", options.scene_source, "--people", str(options.people)]
+        command += ["--seed", str(options.seed), "--width", str(width), "--height", str(height), *more]
         self._pose = SnapshotWriter(state_length)
         try:
             pose_fd = self._pose.fd
@@ -40,16 +57,16 @@ class RenderProcess:
         """Process id."""
         return self._child.pid
 
-    def show(self, render_state: NDArray[float64]) -> None:
-        """Make this the state that the next picture is rendered from; takes microseconds."""
+    def show(self, render_state: NDArray[np.float64]) -> None:
+        """Set the state for the next image; takes microseconds."""
         self._pose.write(render_state)
 
     def send(self, line: bytes) -> None:
-        """Send a line to the process; `events` notices one that has died."""
+        """Send a line to the process; `events` detects a dead process."""
         self._child.send(line)
 
     def wait_ready(self, stop: Sequence[int]) -> bool:
-        """Wait until the camera serves pictures; False when `stop` gets an element first. Raises CameraProcessError."""
+        """Wait until the camera is ready; False if `stop` gets an element first. Raises CameraProcessError."""
         deadline_ns = time.monotonic_ns() + int(_START_TIMEOUT_S * 1e9)
         while not any(event["event"] == "ready" for event in self.events()):
             if stop:
@@ -60,7 +77,7 @@ class RenderProcess:
         return True
 
     def events(self) -> list[Message]:
-        """Events that the process has reported since the last call. Raises CameraProcessError."""
+        """Return the events since the last call. Raises CameraProcessError."""
         lines = self._child.read()
         if self._child.at_end:
             code = self._child.wait(_END_TIMEOUT_S)  # None: it closed its output and lives on; `close` kills it
@@ -69,12 +86,20 @@ class RenderProcess:
         return [_event(line) for line in lines]
 
     def close(self) -> None:
-        """End the process; killed if it does not end by itself. May be called twice."""
+        """End the process, by SIGKILL after a timeout; may be called twice."""
         if self._closed:
             return
         self._closed = True
         self._child.close(_END_TIMEOUT_S)
         self._pose.close()
+
+
+def encode_jpeg(rgb: NDArray[np.uint8]) -> bytes:
+    """Encode an RGB image [h, w, 3] as JPEG. Raises RuntimeError."""
+    done, data = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    if not done:
+        raise RuntimeError("OpenCV could not encode a camera frame as JPEG")
+    return data.tobytes()
 
 
 def _event(line: bytes) -> Message:

@@ -23,7 +23,7 @@ Tick = Callable[[], None]
 
 
 class StepError(RuntimeError):
-    """One step of the run failed; the text is what the user has to know, log included."""
+    """A failed step of a run; the message contains the end of its log."""
 
 
 @dataclass
@@ -36,18 +36,18 @@ class Child:
 
     @property
     def running(self) -> bool:
-        """Whether it has not ended yet."""
+        """Whether the process still runs."""
         return self.process.poll() is None
 
     def failure(self, what: str) -> StepError:
-        """An error naming the step, its log and the log's last lines."""
+        """Return an error with the step, its log and the log's last lines."""
         lines = "\n".join(f"    {line}" for line in last_lines(self.log)) or "    (the log is empty)"
         return StepError(f"step '{self.step}' failed: {what}; its log {self.log} ends with\n{lines}")
 
 
 @dataclass
 class Children:
-    """All processes of a run, ended in reverse order of their start when the block is left."""
+    """All processes of a run; leaving the block ends them in reverse order of their start."""
 
     log_dir: Path
     grace_s: float = 5.0
@@ -64,9 +64,9 @@ class Children:
                 self.end(child)
 
     def start(self, step: str, command: Sequence[str], *, fifo_priority: int = 0) -> Child:
-        """Start a step; StepError when its program cannot be started at all.
+        """Start a step. Raises StepError if its program cannot be started.
 
-        `fifo_priority` above 0: before everything else on its core, where this user may have that.
+        `fifo_priority` above 0: real-time priority, if the user is permitted to use it.
         """
         log = self.log_dir / f"{step}.log"
         with log.open("wb") as stream:
@@ -87,7 +87,7 @@ class Children:
         return child
 
     def wait_until(self, child: Child, ready: Callable[[], bool], timeout_s: float, what: str, tick: Tick) -> None:
-        """Wait until `ready()`; StepError when the child ends before or the time is over."""
+        """Wait until `ready()`. Raises StepError if a child ends before, or after `timeout_s`."""
         deadline_ns = time.monotonic_ns() + int(timeout_s * 1e9)
         while not ready():
             self.check_others(None)
@@ -97,7 +97,7 @@ class Children:
             time.sleep(_POLL_S)
 
     def wait(self, child: Child, timeout_s: float, tick: Tick) -> int:
-        """Wait for a child's own end and return its exit code; any other child that ends meanwhile is a StepError."""
+        """Wait until a child ends and return its exit code. Raises StepError if another child ends before."""
         deadline_ns = time.monotonic_ns() + int(timeout_s * 1e9)
         while child.running:
             self.check_others(child)
@@ -108,13 +108,13 @@ class Children:
         return child.process.returncode
 
     def check_others(self, but: Child | None) -> None:
-        """StepError when a started child other than `but` has ended by itself."""
+        """Check that all children except `but` still run. Raises StepError."""
         for child in self._started:
             if child is not but and not child.running:
                 raise child.failure(f"ended too early with exit code {child.process.returncode}")
 
     def stop(self, child: Child) -> int:
-        """Ask a child to end (SIGINT) and return its exit code; StepError when it has to be killed."""
+        """End a child by SIGINT and return its exit code. Raises StepError if it has to be killed."""
         ended_itself = self._interrupt(child)
         self._started.remove(child)
         if not ended_itself:
@@ -122,11 +122,11 @@ class Children:
         return child.process.returncode
 
     def forget(self, child: Child) -> None:
-        """Take a child that has ended by itself, as it should, off the list."""
+        """Remove a child that has ended as expected."""
         self._started.remove(child)
 
     def end(self, child: Child) -> None:
-        """End a child without complaint: SIGINT, then SIGKILL to all it started."""
+        """End a child by SIGINT, then its whole session by SIGKILL."""
         self._interrupt(child)
 
     def _interrupt(self, child: Child) -> bool:
@@ -144,7 +144,7 @@ class Children:
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Let no further Ctrl-C or SIGTERM break off a clean-up (which takes a few seconds at most)."""
+    """Ignore SIGINT and SIGTERM during a clean-up, which takes a few seconds at most."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -157,7 +157,7 @@ def uninterrupted() -> Iterator[None]:
 
 
 def _kill_session(pid: int) -> None:
-    with suppress(ProcessLookupError, PermissionError):  # nobody of that group is left
+    with suppress(ProcessLookupError, PermissionError):  # the group has ended
         os.killpg(pid, signal.SIGKILL)  # start_new_session made the child the leader of a group of its own
 
 

@@ -13,14 +13,16 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
+from typing import Literal
 
 import firmware_bridge
 from edge.state.switches import SwitchOptions
 from firmware_bridge.core.config import BRIDGE_PRIORITY
-from sim_hil.protocols.fault_client import FaultClient
+from sim_hil.protocols.fault_socket import FaultClient
 from sim_hil.realtime.children import Child, Children, StepError, Tick, uninterrupted
 
 ROBOT_FILE = Path(firmware_bridge.__file__).parent / "robots" / "go2_sim.toml"
+ProcessName = Literal["robot", "bridge", "runner"]
 READY_LINE = "edge-hil: ready"
 ARMED_LINE = "armed and driving"
 
@@ -72,7 +74,7 @@ class StackOptions:
 class Stack:
     """Running stack: a context manager that ends exactly the processes that it started, the runner first."""
 
-    def __init__(self, options: StackOptions, commands: Mapping[str, Sequence[str]] = COMMANDS) -> None:
+    def __init__(self, options: StackOptions) -> None:
         self.options = options
         self.runs = 0
         """Number of started runners; also the number in the newest runner's file names."""
@@ -80,7 +82,6 @@ class Stack:
         self.bridge: Child | None = None
         self.runner: Child | None = None
         self.faults: FaultClient | None = None
-        self._commands = commands
         self._children = Children(options.folder, grace_s=GRACE_S)
         self._sockets = Path(tempfile.mkdtemp(prefix="tic-"))
         self._robot_file = _robot_file(options)
@@ -125,7 +126,7 @@ class Stack:
         options = self.options
         x_m, y_m, theta_rad = options.start
         command = [
-            *self._commands["edge-hil"],
+            *COMMANDS["edge-hil"],
             *("--robot", "go2", "--protocol", "unitree", "--interface", "lo", "--scene", options.scene),
             # One argument, because the value may begin with a minus.
             f"--start={x_m!r},{y_m!r},{math.degrees(theta_rad)!r}",
@@ -152,7 +153,7 @@ class Stack:
         socket = self._sockets / "bridge"
         socket.unlink(missing_ok=True)  # left by a killed bridge
         name = f"edge-bridge-{self.runs + 1}"
-        command = [*self._commands["edge-bridge"], *self._link(), "--json", str(self.result(name))]
+        command = [*COMMANDS["edge-bridge"], *self._link(), "--json", str(self.result(name))]
         bridge = self.bridge = self._children.start(name, command, fifo_priority=BRIDGE_PRIORITY)
         self._children.wait_until(bridge, socket.exists, BRIDGE_TIMEOUT_S, f"socket {socket}", tick)
 
@@ -162,7 +163,7 @@ class Stack:
         self.runs += 1
         name = f"edge-run-{self.runs}"
         command = [
-            *self._commands["edge-run"],
+            *COMMANDS["edge-run"],
             *self._link(),
             *("--artifacts", str(options.artifacts), "--instruction", instruction, "--mode", options.mode),
             *("--release-delay", options.release_delay),
@@ -186,27 +187,15 @@ class Stack:
         """Check that robot and bridge still run. Raises StepError."""
         self._children.check_others(self.runner)
 
-    def end_runner(self) -> int | None:
-        """End the runner if it still runs; return its exit code, negative for a signal, None without a runner."""
-        code = self._end(self.runner)
-        self.runner = None
-        return code
+    def end(self, name: ProcessName) -> int | None:
+        """End a process and return its exit code, negative for a signal; None if it was not started.
 
-    def end_bridge(self) -> int | None:
-        """End the bridge; return its exit code as `end_runner` does."""
-        code = self._end(self.bridge)
-        self.bridge = None
-        return code
-
-    def end_robot(self) -> int | None:
-        """End the simulated robot, which completes its trace; return its exit code as `end_runner` does."""
-        code = self._end(self.robot)
-        self.robot = None
-        return code
-
-    def _end(self, child: Child | None) -> int | None:
+        Ending the robot completes its trace.
+        """
+        child: Child | None = getattr(self, name)
         if child is None:
             return None
+        setattr(self, name, None)
         self._children.end(child)
         with suppress(ValueError):
             self._children.forget(child)

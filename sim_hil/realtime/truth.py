@@ -1,4 +1,4 @@
-"""Follows edge-hil's trace while it is written: where the robot truly is, what it touches, what it was told."""
+"""Ground truth of a run: the poses in edge-hil's trace, read while it is written."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class TruePose:
-    """One line of ground truth: m, rad, world frame; `touching` are labels of what the robot touched."""
+    """One line of ground truth: m, rad, world frame; `touching`: labels of the touched objects."""
 
     t_ns: int
     x_m: float
@@ -20,40 +20,45 @@ class TruePose:
     touching: tuple[str, ...]
 
 
-class TruthTail:
-    """Reads what was added to a trace; an unfinished last line is left for the next time."""
+class LineTail:
+    """Reads each line of a growing file of JSON lines once; an unfinished last line is read later."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._offset = 0
-        self.newest: TruePose | None = None
 
-    def update(self) -> list[TruePose]:
-        """The poses since the last call, in order."""
-        poses = [pose_of(line) for line in self._lines() if line.get("kind") == "pose"]
-        if poses:
-            self.newest = poses[-1]
-        return poses
-
-    def _lines(self) -> Iterator[dict[str, Any]]:
+    def lines(self) -> list[dict[str, Any]]:
+        """Return the lines added since the last call; none while there is no file."""
         try:
             with self._path.open("rb") as stream:
                 stream.seek(self._offset)
                 added = stream.read()
         except FileNotFoundError:
-            return
+            return []
         whole = added[: added.rfind(b"\n") + 1]
         self._offset += len(whole)
-        yield from parsed(whole)
+        return list(parsed(whole))
 
 
-def pose_of(line: dict[str, Any]) -> TruePose:
-    """The pose of a line of kind `pose`."""
-    return TruePose(int(line["t_ns"]), line["x"], line["y"], line["theta"], tuple(line["touching"]))
+class TruthTail(LineTail):
+    """Reads the poses that were added to a trace."""
+
+    newest: TruePose | None = None
+
+    def update(self) -> list[TruePose]:
+        """Return the poses since the last call, in order."""
+        poses = [
+            TruePose(int(line["t_ns"]), line["x"], line["y"], line["theta"], tuple(line["touching"]))
+            for line in self.lines()
+            if line.get("kind") == "pose"
+        ]
+        if poses:
+            self.newest = poses[-1]
+        return poses
 
 
 def parsed(text: bytes) -> Iterator[dict[str, Any]]:
-    """Objects of a JSON-lines text; a line that was cut off, which only the last one can be, is left out."""
+    """Yield the objects of a JSON-lines text; an incomplete line (only the last can be) is left out."""
     for line in text.splitlines():
         try:
             yield json.loads(line)
@@ -62,7 +67,7 @@ def parsed(text: bytes) -> Iterator[dict[str, Any]]:
 
 
 def read_lines(path: Path) -> Iterator[dict[str, Any]]:
-    """Objects of a JSON-lines file one by one, a cut last line left out; raises OSError."""
+    """Yield the objects of a JSON-lines file; an incomplete last line is left out. Raises OSError."""
     with path.open("rb") as stream:
         for line in stream:
             yield from parsed(line)

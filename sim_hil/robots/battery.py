@@ -28,9 +28,9 @@ class BatteryReading:
     current_a: float
 
 
-def open_circuit_v(soc: float) -> float:
-    """Return the open-circuit voltage of the pack for a charge of 0..1, V; linear."""
-    return CELLS * (CELL_EMPTY_V + soc * (CELL_FULL_V - CELL_EMPTY_V))
+def open_circuit_v(soc: float, cells: int = CELLS) -> float:
+    """Return the open-circuit voltage of a pack of lithium cells for a charge of 0..1, V; linear."""
+    return cells * (CELL_EMPTY_V + soc * (CELL_FULL_V - CELL_EMPTY_V))
 
 
 class Battery:

@@ -1,4 +1,4 @@
-"""What every simulated robot is to the world around it: a body that is commanded a velocity and tells its truth."""
+"""Interface of simulated robots: a body that follows velocity commands and reports its ground truth."""
 
 from __future__ import annotations
 
@@ -35,56 +35,35 @@ class Robot(Protocol):
     @property
     def body(self) -> int:
         """PyBullet's id of the body."""
-        ...
 
     @property
     def radius_m(self) -> float:
-        """Footprint circle for planners, m: what the robot sweeps when it turns in place."""
-        ...
-
-    @property
-    def half_length_m(self) -> float:
-        """Furthest that any part reaches ahead of or behind the base's origin while it moves, m."""
-        ...
-
-    @property
-    def render_fields(self) -> int:
-        """How many numbers `render_state` has."""
-        ...
+        """Radius of the circle that the robot covers when it turns in place, m; for planners."""
 
     @property
     def ready(self) -> bool:
-        """Whether a velocity command would be obeyed now."""
-        ...
+        """Whether the robot would follow a velocity command now."""
 
     def drive(self) -> None:
         """Set the motors for the step that follows."""
-        ...
 
     def observe(self) -> None:
         """Read the body after a step."""
-        ...
 
     def pose(self) -> tuple[tuple[float, float, float], float]:
         """Base position, m, and heading, rad."""
-        ...
 
     def up(self) -> float:
         """World z of the base's up axis: 1 upright, -1 on its back."""
-        ...
 
     def command(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
-        """Take a velocity of the body frame, kept for 1 s; a base that cannot move sideways ignores `vy_mps`."""
-        ...
+        """Command a velocity in the body frame for 1 s; a base that cannot move sideways ignores `vy_mps`."""
 
     def stand(self) -> None:
-        """Make it ready to move, as its controller would; takes simulated time, see `ready`. May be repeated."""
-        ...
+        """Get ready to move, as its controller would; takes simulated time, see `ready`. May be repeated."""
 
     def truth(self, time_s: float) -> BaseTruth:
-        """Snapshot of now, stamped `time_s`."""
-        ...
+        """Return the current ground truth, stamped `time_s`."""
 
     def render_state(self) -> tuple[float, ...]:
-        """Base position m, quaternion xyzw, then what this robot's joints need: `render_fields` numbers."""
-        ...
+        """Return base position, m, quaternion xyzw, and the joint angles that a renderer needs."""

@@ -1,4 +1,4 @@
-"""Drifting odometry: true planar motion in, what a robot that slips and turns unnoticed would report out. Pure, seeded.
+"""Drifting odometry: true planar motion in, the report of a robot with unnoticed slip out. Pure, seeded.
 
 The paper (table 14) disturbs translation and rotation by Gaussian noise whose size at each step is proportional to the
 distance travelled in it, and lets it accumulate: typical (0.02 m/m, 1 deg/m), severe (0.05 m/m, 5 deg/m). It does not
@@ -54,7 +54,7 @@ LEVELS: Final[Mapping[str, NoiseLevel]] = MappingProxyType(
 
 @dataclass(frozen=True)
 class NoisyOdometry:
-    """What is reported: `T_odom_base`, and the body velocity that fits its last increment (m/s, m/s, rad/s)."""
+    """Reported odometry: `T_odom_base`, and the body velocity of its last increment (m/s, m/s, rad/s)."""
 
     T_odom_base: SE2
     vx_mps: float
@@ -71,17 +71,7 @@ class OdometryNoise:
         self._rng = np.random.default_rng(seed)
         self._sigmas = (level.translation_m_per_m, level.translation_m_per_m, level.rotation_rad_per_m)
         self._rates = self._draw()
-        self._pose = start if start is not None else SE2(0.0, 0.0, 0.0)
-
-    @property
-    def pose(self) -> SE2:
-        """The newest reported `T_odom_base`."""
-        return self._pose
-
-    @property
-    def rates(self) -> tuple[float, float, float]:
-        """Error rates in force now: forward m/m, sideways m/m, rotation rad/m."""
-        return self._rates
+        self.pose = start or SE2(0.0, 0.0, 0.0)  # the newest report
 
     def step(self, T_before_after: SE2, dt_s: float) -> NoisyOdometry:
         """Report after a true increment of `dt_s` in the body frame before it. Raises ValueError if dt_s <= 0."""
@@ -92,8 +82,8 @@ class OdometryNoise:
             self._walk(distance_m)
         ex, ey, eth = (rate * distance_m for rate in self._rates)
         noisy = SE2(T_before_after.x_m + ex, T_before_after.y_m + ey, T_before_after.theta_rad + eth)
-        self._pose = self._pose @ noisy
-        return NoisyOdometry(self._pose, noisy.x_m / dt_s, noisy.y_m / dt_s, noisy.theta_rad / dt_s)
+        self.pose = self.pose @ noisy
+        return NoisyOdometry(self.pose, noisy.x_m / dt_s, noisy.y_m / dt_s, noisy.theta_rad / dt_s)
 
     def _walk(self, distance_m: float) -> None:
         """Move the error rates along an Ornstein-Uhlenbeck process by a distance, exactly for any step."""

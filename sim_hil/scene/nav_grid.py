@@ -16,8 +16,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from sim_hil.scene.scene import Box, Scene, Vec2
-from sim_hil.scene.terrain import Terrain
+from sim_hil.scene.scene import Box, Scene, Terrain, Vec2
 
 Array = NDArray[np.float64]
 
@@ -42,18 +41,14 @@ class NavGrid:
     """Free space of a scene for a robot that needs `clearance_m` (radius plus margin) around its centre.
 
     `height_m`: objects that begin above this height are no obstacles. `max_step_m`: higher steps of the ground are
-    obstacles. Raises ValueError.
+    obstacles. `clearances`: distance from each cell's centre to the nearest obstacle [rows, columns], m, capped,
+    negative inside one. `free`: whether the robot's centre may be in each cell [rows, columns]. Raises ValueError.
     """
 
     def __init__(
-        self,
-        scene: Scene,
-        *,
-        clearance_m: float,
-        resolution_m: float = 0.1,
-        height_m: float = 0.8,
+        self, scene: Scene, *, clearance_m: float, resolution_m: float = 0.1, height_m: float = 0.8,
         max_step_m: float = MAX_STEP_M,
-    ) -> None:
+    ) -> None:  # fmt: skip
         if not (0 <= clearance_m < CLEARANCE_CAP_M and 0.02 <= resolution_m <= 1.0):
             raise ValueError(
                 f"navigation grid: expected a clearance of 0..{CLEARANCE_CAP_M} m and cells of 0.02..1 m,"
@@ -65,23 +60,14 @@ class NavGrid:
         self.origin_m = (x0, y0)
         self.shape = (ceil((y1 - y0) / resolution_m), ceil((x1 - x0) / resolution_m))
         boxes = [box for _, box in scene.obstacles() if box.centre_m[2] - box.size_m[2] / 2 < height_m]
-        self._clearances = self._measure(boxes, (x1, y1))
+        self.clearances = self._measure(boxes, (x1, y1))
         self._keep_off_edges(scene.terrain, max_step_m)
-        self._free = self._clearances >= clearance_m - _HAIR_M
-        if not self._free.any():
+        self.free = self.clearances >= clearance_m - _HAIR_M
+        if not self.free.any():
             raise ValueError(f"navigation grid: scene {scene.name} has no room for a clearance of {clearance_m} m")
-        self._nearest = self._snaps()
+        # Row and column of the nearest free cell of each cell [2, rows, columns].
+        self._nearest = distance_transform_edt(~self.free, return_distances=False, return_indices=True)
         self._trees: dict[tuple[int, int], tuple[Array, NDArray[np.int32]]] = {}
-
-    @property
-    def clearances(self) -> Array:
-        """Distance from each cell's centre to the nearest obstacle [rows, columns], m, capped; negative inside one."""
-        return self._clearances
-
-    @property
-    def free(self) -> NDArray[np.bool_]:
-        """Whether the robot's centre may be in each cell [rows, columns]."""
-        return self._free
 
     def _centres(self, rows: slice, columns: slice) -> tuple[Array, Array]:
         x = self.origin_m[0] + (np.arange(columns.start, columns.stop) + 0.5) * self.resolution_m
@@ -140,18 +126,13 @@ class NavGrid:
             # An edge lies between two marked cells: half a cell from either centre.
             gaps = distance_transform_edt(~edge) * self.resolution_m + 0.5 * self.resolution_m
             gaps[edge] = 0.5 * self.resolution_m
-            self._clearances = np.minimum(self._clearances, gaps)
-
-    def _snaps(self) -> NDArray[np.int32]:
-        """Return row and column of the nearest free cell of each cell [2, rows, columns]."""
-        nearest = distance_transform_edt(~self._free, return_distances=False, return_indices=True)
-        return np.asarray(nearest, dtype=np.int32)
+            self.clearances = np.minimum(self.clearances, gaps)
 
     @cached_property
     def _graph(self) -> tuple[NDArray[np.int32], NDArray[np.int64], csr_matrix]:
         """Ids of the free cells [rows, columns], their rows and columns [n, 2], and the graph of steps [n, n]."""
-        ids, source, target, length = links(self._free, self.resolution_m)
-        cells = np.argwhere(self._free)
+        ids, source, target, length = links(self.free, self.resolution_m)
+        cells = np.argwhere(self.free)
         return ids, cells, csr_matrix((length, (source, target)), shape=(len(cells), len(cells)))
 
     def cell(self, x_m: float, y_m: float) -> tuple[int, int]:
@@ -187,9 +168,7 @@ class NavGrid:
 
     def clearances_at(self, points_m: Array) -> Array:
         """Return `clearance_m` of many points: [n, 2] -> [n]."""
-        return self._interpolate(self._clearances, points_m)
-
-    def _interpolate(self, grid: Array, points_m: Array) -> Array:
+        grid = self.clearances
         u = (points_m[..., 0] - self.origin_m[0]) / self.resolution_m - 0.5
         v = (points_m[..., 1] - self.origin_m[1]) / self.resolution_m - 0.5
         outside = (u < -0.5) | (v < -0.5) | (u > self.shape[1] - 0.5) | (v > self.shape[0] - 0.5)
@@ -220,7 +199,7 @@ class NavGrid:
         field = np.full(self.shape, np.inf)
         tree = self._tree(goal)
         if tree is not None:
-            field[self._free] = tree[0]
+            field[self.free] = tree[0]
         return field
 
     def field_at(self, field: Array, x_m: float, y_m: float) -> float:
@@ -270,7 +249,6 @@ class NavGrid:
         count = max(2, ceil(hypot(b[0] - a[0], b[1] - a[1]) / (0.5 * self.resolution_m)) + 1)
         share = np.linspace(0.0, 1.0, count)[:, None]
         points = np.array(a) * (1 - share) + np.array(b) * share
-
         return bool(np.all(self.clearances_at(points) >= self.required_m - _HAIR_M))
 
     def _pulled(self, points: list[Vec2]) -> list[Vec2]:

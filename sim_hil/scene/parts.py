@@ -1,12 +1,13 @@
-"""Parts of a scene: walls, objects, floor patches, routes and places of people, named areas."""
+"""Parts of a scene: walls, objects, floor patches, terrain, routes and places of people, named areas."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass
-from math import atan2, cos, hypot, sin
+from math import atan2, cos, hypot, pi, sin
 
-from sim_hil.scene.kinds import FLAT_KINDS, KINDS, SOLID_KINDS
+from sim_hil.scene.kinds import KINDS
 from sim_hil.scene.table import SceneError
 
 Vec2 = tuple[float, float]
@@ -31,15 +32,8 @@ AREA_KINDS = frozenset(
     ("corridor", "room", "lobby", "aisle", "yard", "plaza", "sidewalk", "street", "crossing", "garden")
 )
 PLACE_KINDS = frozenset(("stand", "sit", "queue", "door"))
-
-
-@dataclass(frozen=True)
-class Footprint:
-    """Outline of a wall or object on the floor: polygon [(x, y), ...] in world m, for top-down pictures."""
-
-    label: str
-    kind: str
-    polygon: tuple[Vec2, ...]
+TERRAIN_KINDS = frozenset(("ramp", "bump", "kerb", "platform"))
+_BUMP_SEGMENTS = 12
 
 
 @dataclass(frozen=True)
@@ -103,7 +97,7 @@ class SceneObject:
     landmark: str = ""
 
     def __post_init__(self) -> None:
-        check_choice(f"object {self.label}", "kind", self.kind, SOLID_KINDS | FLAT_KINDS)
+        check_choice(f"object {self.label}", "kind", self.kind, KINDS)
         if min(self.size_m) <= 0:
             raise SceneError(f"object {self.label}: size_m must be positive, found {self.size_m}")
         if not all(0 <= channel <= 1 for channel in self.colour):
@@ -112,7 +106,7 @@ class SceneObject:
     @property
     def solid(self) -> bool:
         """Whether the object is an obstacle for robots and people."""
-        return self.kind in SOLID_KINDS
+        return KINDS[self.kind].solid
 
     @property
     def box(self) -> Box:
@@ -150,6 +144,69 @@ class Floor:
         check_choice("floors", "texture", self.texture, FLOOR_TEXTURES)
         if area_m2(self.polygon) <= 1e-6 or not is_convex(self.polygon):
             raise SceneError(f"floors: {self.texture}: expected a convex polygon, found {self.polygon}")
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """Solid ground, up to `rise_m` above `position_m` (centre of its underside), m.
+
+    `size_m`: length along `heading_rad`, and width. A ramp rises from its back to its front, where it drops off; a bump
+    follows half a sine wave along its length; kerbs and platforms are flat.
+    """
+
+    label: str
+    kind: str
+    position_m: Vec3
+    heading_rad: float
+    size_m: Vec2
+    rise_m: float
+    texture: str
+
+    def __post_init__(self) -> None:
+        check_choice(f"terrain {self.label}", "kind", self.kind, TERRAIN_KINDS)
+        check_choice(f"terrain {self.label}", "texture", self.texture, FLOOR_TEXTURES)
+        if min(self.size_m) <= 0 or self.rise_m <= 0:
+            raise SceneError(
+                f"terrain {self.label}: size_m and rise_m must be positive, found {self.size_m}, {self.rise_m}"
+            )
+
+    def profile(self) -> tuple[Vec2, ...]:
+        """Top line along the heading from back to front: (distance from the middle, height over the underside), m."""
+        half, rise = self.size_m[0] / 2, self.rise_m
+        if self.kind == "ramp":
+            return ((-half, 0.0), (half, rise))
+        if self.kind == "bump":
+            shares = [k / _BUMP_SEGMENTS for k in range(_BUMP_SEGMENTS + 1)]
+            return tuple((half * (2 * share - 1), rise * max(sin(pi * share), 0.0)) for share in shares)
+        return ((-half, rise), (half, rise))
+
+    def vertices_m(self) -> tuple[Vec3, ...]:
+        """Vertices of the convex solid in the world, m, for a physics engine."""
+        line = {(-self.size_m[0] / 2, 0.0), *self.profile(), (self.size_m[0] / 2, 0.0)}
+        half = self.size_m[1] / 2
+        return tuple(self.point(u, side * half, h) for u, h in sorted(line) for side in (-1, 1))
+
+    def point(self, u: float, v: float, h: float) -> Vec3:
+        """World coordinates, m, of a point along the heading, to the left and up from the middle of the underside."""
+        (x, y, z), c, s = self.position_m, cos(self.heading_rad), sin(self.heading_rad)
+        return (x + c * u - s * v, y + s * u + c * v, z + h)
+
+    def height_m(self, x: float, y: float) -> float | None:
+        """Height of its top above the world's floor there; None beside it."""
+        (px, py, pz), c, s = self.position_m, cos(self.heading_rad), sin(self.heading_rad)
+        u, v = c * (x - px) + s * (y - py), -s * (x - px) + c * (y - py)
+        if abs(v) > self.size_m[1] / 2 or abs(u) > self.size_m[0] / 2:
+            return None
+        line = self.profile()
+        for (a, low), (b, high) in itertools.pairwise(line):
+            if u <= b:
+                return pz + low + (high - low) * (u - a) / (b - a)
+        return pz + line[-1][1]
+
+    def corners(self) -> tuple[Vec2, ...]:
+        """Outline on the floor, counter-clockwise."""
+        a, b = self.size_m[0] / 2, self.size_m[1] / 2
+        return tuple(self.point(u, v, 0)[:2] for u, v in ((-a, -b), (a, -b), (a, b), (-a, b)))
 
 
 @dataclass(frozen=True)
@@ -206,10 +263,10 @@ class Route:
             raise SceneError("route: expected at least two different points")
 
 
-def check_choice(what: str, key: str, value: str, known: Iterable[str]) -> None:
-    """Check that a value is one of the known ones. Raises SceneError."""
-    if value not in known:
-        raise SceneError(f"{what}: unknown {key} {value!r}, expected one of {', '.join(sorted(known))}")
+def check_choice(what: str, key: str, value: str, choices: Iterable[str]) -> None:
+    """Check that a value is one of the choices. Raises SceneError."""
+    if value not in choices:
+        raise SceneError(f"{what}: unknown {key} {value!r}, expected one of {', '.join(sorted(choices))}")
 
 
 def area_m2(polygon: tuple[Vec2, ...]) -> float:

@@ -1,12 +1,17 @@
-"""A scene as data: floor, walls, objects, terrain, routes and places of people; read from a TOML file and checked."""
+"""A scene as data: floor, walls, objects, terrain, routes and places of people; reads, checks and writes TOML files."""
 
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, asdict, dataclass, fields
+from math import degrees, radians
 from pathlib import Path
+from typing import Any
 
-from sim_hil.scene.kinds import FLAT_KINDS, KINDS, SOLID_KINDS
+import tomli_w
+
+from sim_hil.scene.kinds import KINDS
 from sim_hil.scene.parts import (
     CEILING_TEXTURES,
     FLOOR_TEXTURES,
@@ -15,18 +20,16 @@ from sim_hil.scene.parts import (
     Area,
     Box,
     Floor,
-    Footprint,
     Place,
     Route,
     SceneObject,
+    Terrain,
     Vec2,
     Vec3,
     Wall,
     check_choice,
 )
-from sim_hil.scene.reader import read_area, read_floor, read_object, read_place, read_route, read_terrain, read_wall
 from sim_hil.scene.table import SceneError, Table
-from sim_hil.scene.terrain import ConvexPiece, Terrain
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -34,13 +37,24 @@ else:
     import tomli as tomllib
 
 __all__ = [
-    "CEILING_TEXTURES", "FLAT_KINDS", "FLOOR_TEXTURES", "KINDS", "SCENES", "SKY", "SOLID_KINDS", "TEXTURES",
-    "WALL_TEXTURES", "Area", "Box", "ConvexPiece", "Floor", "Footprint", "Place", "Route", "Scene", "SceneError",
-    "SceneObject", "Terrain", "Vec2", "Vec3", "Wall", "load_scene", "parse_scene", "scene_names",
+    "CEILING_TEXTURES", "FLOOR_TEXTURES", "KINDS", "SCENES", "SKY", "TEXTURES",
+    "WALL_TEXTURES", "Area", "Box", "Floor", "Place", "Route", "Scene", "SceneError",
+    "SceneObject", "Terrain", "Vec2", "Vec3", "Wall", "load_scene", "parse_scene", "scene_names", "scene_to_toml",
 ]  # fmt: skip
 
 SCENES = Path(__file__).parents[1] / "scenes"
 SKY: Vec3 = (0.60, 0.76, 0.92)
+# Sections of a scene file in the order in which they are written; the keys are the fields of their class.
+_SECTIONS: dict[str, type[Any]] = {
+    "floors": Floor, "terrain": Terrain, "walls": Wall, "objects": SceneObject, "areas": Area, "places": Place,
+    "routes": Route,
+}  # fmt: skip
+# Defaults of a file, in addition to those of the classes; an object's size and colour default to those of its kind.
+_DEFAULTS: dict[str, dict[str, Any]] = {
+    "walls": {"thickness_m": 0.15, "height_m": 2.6, "texture": "wall_wainscot"},
+    "objects": {"text": ""},
+}
+_OMITTED_IF_EMPTY = ("text", "landmark")
 
 
 @dataclass(frozen=True)
@@ -85,11 +99,6 @@ class Scene:
         check_choice("floor", "texture", self.floor_texture, FLOOR_TEXTURES)
         check_choice("scene", "ceiling_texture", self.ceiling_texture, CEILING_TEXTURES)
 
-    def footprints(self) -> list[Footprint]:
-        """Return the outlines of all walls and objects, for a map."""
-        outlines = [Footprint(wall.label, "wall", wall.box.corners()) for wall in self.walls]
-        return outlines + [Footprint(thing.label, thing.kind, thing.box.corners()) for thing in self.objects]
-
     def obstacles(self) -> list[tuple[str, Box]]:
         """Return label and box of every obstacle; an object with several boxes occurs several times.
 
@@ -97,10 +106,6 @@ class Scene:
         """
         walls = [(wall.label, wall.box) for wall in self.walls]
         return walls + [(thing.label, box) for thing in self.objects for box in thing.boxes]
-
-    def terrain_pieces(self) -> list[ConvexPiece]:
-        """Return the terrain as convex solids for a physics engine."""
-        return [terrain.piece() for terrain in self.terrain]
 
     def ground_height_m(self, x: float, y: float) -> float:
         """Return the height of the ground at a point, m: the highest terrain, or 0."""
@@ -114,13 +119,6 @@ class Scene:
     def landmarks(self) -> list[SceneObject]:
         """Return the objects that instructions may name."""
         return [thing for thing in self.objects if thing.landmark]
-
-    def without(self, label: str) -> Scene:
-        """Return the scene without one object. Raises KeyError for an unknown label."""
-        rest = tuple(thing for thing in self.objects if thing.label != label)
-        if len(rest) == len(self.objects):
-            raise KeyError(label)
-        return replace(self, objects=rest)
 
 
 def parse_scene(text: str, source: str) -> Scene:
@@ -142,13 +140,7 @@ def parse_scene(text: str, source: str) -> Scene:
             ceiling_height_m=table.number("ceiling_height_m", 0.0),
             ceiling_texture=table.text("ceiling_texture", "ceiling_panels"),
             sky=table.vector("sky", 3, SKY),
-            walls=tuple(read_wall(item) for item in table.tables("walls")),
-            objects=tuple(read_object(item) for item in table.tables("objects")),
-            routes=tuple(read_route(item) for item in table.tables("routes")),
-            floors=tuple(read_floor(item) for item in table.tables("floors")),
-            terrain=tuple(read_terrain(item) for item in table.tables("terrain")),
-            areas=tuple(read_area(item) for item in table.tables("areas")),
-            places=tuple(read_place(item) for item in table.tables("places")),
+            **{name: tuple(_read(name, item) for item in table.tables(name)) for name in _SECTIONS},
         )
         floor.done()
         table.done()
@@ -177,3 +169,68 @@ def load_scene(name_or_path: str | Path) -> Scene:
     except (OSError, UnicodeDecodeError) as error:
         raise SceneError(f"{path}: cannot be read as a scene file: {error}") from error
     return parse_scene(text, path.name)
+
+
+def _read(section: str, table: Table) -> Any:
+    """Read one part of a scene from a table of its section. Raises SceneError."""
+    values: dict[str, Any] = {}
+    defaults = _DEFAULTS.get(section, {})
+    scalars: dict[str, Callable[..., Any]] = {"str": table.text, "float": table.number, "int": table.whole}
+    for key, kind, default in _fields(section):
+        default = defaults.get(key, default)
+        if section == "objects" and key in ("size_m", "colour"):
+            check_choice(f"{table.what}: {values['label']}", "kind", values["kind"], KINDS)
+            default = getattr(KINDS[values["kind"]], key)
+        if key == "heading_rad":
+            values[key] = table.heading(default)
+        elif section == "floors" and key == "polygon":
+            values[key] = _floor_polygon(table)
+        elif kind == "tuple[Vec2, ...]":
+            values[key] = table.points(key)
+        elif kind in ("Vec2", "Vec3"):
+            values[key] = table.vector(key, int(kind[-1]), default)
+        else:
+            values[key] = scalars[kind](key, default)
+    part = _SECTIONS[section](**values)
+    table.done()
+    return part
+
+
+def _fields(section: str) -> list[tuple[str, str, Any]]:
+    """Return name, type and default (None: required) of a section's fields, in the order of the file."""
+    found = [(f.name, str(f.type), None if f.default is MISSING else f.default) for f in fields(_SECTIONS[section])]
+    return sorted(found, key=lambda entry: entry[0] not in ("label", "kind", "name"))
+
+
+def _floor_polygon(table: Table) -> tuple[Vec2, ...]:
+    """Read the outline of a floor patch: `polygon`, or the corners `min_m` and `max_m`."""
+    if "polygon" in table:
+        return table.points("polygon")
+    if "min_m" not in table:
+        raise SceneError(f"{table.what}: expected polygon, or min_m and max_m, found neither")
+    (x0, y0), (x1, y1) = table.vector("min_m", 2), table.vector("max_m", 2)
+    return ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
+
+
+def scene_to_toml(scene: Scene) -> str:
+    """Return the text of a scene file; `parse_scene` of it gives an equal scene."""
+    keys = ("name", "start", "goal_xy", "ceiling_height_m", "ceiling_texture", "sky")
+    content: dict[str, Any] = {key: getattr(scene, key) for key in keys}
+    content["floor"] = {key: getattr(scene, f"floor_{key}") for key in ("min_m", "max_m", "texture")}
+    for section in _SECTIONS:
+        if parts := getattr(scene, section):
+            content[section] = [_table(asdict(part)) for part in parts]
+    return tomli_w.dumps(content)
+
+
+def _table(part: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the keys of one part, with the heading in degrees if that is exact to the last bit."""
+    table = {key: value for key, value in part.items() if value or key not in _OMITTED_IF_EMPTY}
+    if "heading_rad" not in table:
+        return table
+    heading_rad = table.pop("heading_rad")
+    exact = degrees(heading_rad)
+    for heading_deg in (round(exact, 3), exact):
+        if radians(heading_deg) == heading_rad:
+            return {**table, "heading_deg": heading_deg}
+    return {**table, "heading_rad": heading_rad}

@@ -16,7 +16,6 @@ from sim_hil.robots.go2.body import rotation_matrix
 from sim_hil.scene.scene import Scene
 from sim_hil.simulation.person_body import PersonBody
 from sim_hil.simulation.renderer import Picture, Renderer
-from sim_hil.simulation.robot_meshes import RobotBody
 from sim_hil.world.scene_meshes import build_scene
 from sim_hil.world.wall_visibility import Sight, Visibility
 
@@ -68,8 +67,7 @@ class CameraWorld:
         self._looks = appearances(people, seed, scene.name) if looks is None else looks
         if len(self._looks) != people:
             raise ValueError(f"camera: expected looks of {people} people, found {len(self._looks)}")
-        self._mount, self._robot_name = MOUNTS[robot], robot
-        self._robot: RobotBody | None = None
+        self._mount = MOUNTS[robot]
         self._renderer = Renderer(scene.sky)
         self._near: dict[int, PersonBody] = {}
         self._far: dict[int, PersonBody] = {}
@@ -92,13 +90,12 @@ class CameraWorld:
 
         `aspect`: aspect ratio of the field of view, which is scaled to the image's size; None: square pixels.
         """
-        self._check(render_state)
+        if render_state.shape != (self.state_size,):
+            raise ValueError(f"render state has shape {render_state.shape}, this world takes ({self.state_size},)")
         mount = self._mount
         rotation = rotation_matrix(tuple(float(v) for v in render_state[3:7]))
         eye = render_state[0:3] + rotation @ mount.position_m
         forward = rotation @ (cos(mount.pitch_rad), 0.0, -sin(mount.pitch_rad))
-        if self._robot is not None:
-            self._robot.hide()
         shape = width / height if aspect is None else aspect
         sight = self._sight(eye, forward, rotation[:, 2], mount.hfov_rad)
         shown = self._fixed if sight is None else [self._fixed[piece] for piece in self._visibility.pieces(sight)]
@@ -106,35 +103,13 @@ class CameraWorld:
         self._show_people(render_state, eye, sight)
         return self._renderer.picture(eye, forward, rotation[:, 2], mount.hfov_rad, width, height, shape)
 
-    def look(
-        self, render_state: Array, eye_m: tuple[float, float, float], target_m: tuple[float, float, float],
-        width: int, height: int, hfov_rad: float = radians(70.0),
-    ) -> Picture:  # fmt: skip
-        """Render the world and the robot from any viewpoint, for reports and inspection."""
-        self._check(render_state)
-        if self._robot is None:
-            self._robot = RobotBody(self._renderer, self._robot_name)
-        self._robot.pose(render_state[: self._mount.fields])
-        eye = np.array(eye_m)
-        forward = np.array(target_m) - eye
-        forward /= np.linalg.norm(forward)
-        self._renderer.arrange(self._fixed, self._fixed)
-        self._show_people(render_state, eye, None)
-        # When looking straight down, north is up.
-        up = np.array((0.0, 0.0, 1.0) if abs(forward[2]) < 0.999 else (0.0, 1.0, 0.0))
-        return self._renderer.picture(eye, forward, up, hfov_rad, width, height, width / height)
-
-    def _check(self, state: Array) -> None:
-        if state.shape != (self.state_size,):
-            raise ValueError(f"render state has shape {state.shape}, this world takes ({self.state_size},)")
-
     def _sight(self, eye: Array, forward: Array, up: Array, hfov_rad: float) -> Sight | None:
         """Return the robot's view cone; None if it lies on its side or looks steeply up or down."""
         flat = float(np.hypot(forward[0], forward[1]))
         if up[2] < _UPRIGHT or flat < _UPRIGHT:
             return None
         # A tilted camera's view is slightly wider on the floor than its field of view.
-        return self._visibility.look(eye[:2], forward[:2] / flat, tan(hfov_rad / 2) / (flat * float(up[2])))
+        return self._visibility.sight(eye[:2], forward[:2] / flat, tan(hfov_rad / 2) / (flat * float(up[2])))
 
     def _show_people(self, state: Array, eye: Array, sight: Sight | None) -> None:
         """Pose the people who may be visible and hide all others."""
@@ -161,6 +136,4 @@ class CameraWorld:
 
     def close(self) -> None:
         """Release the renderer; may be called twice."""
-        if self._robot is not None:
-            self._robot.close()
         self._renderer.close()

@@ -21,8 +21,7 @@ from sim_hil.robots.go2.body import Go2, RobotTruth
 from sim_hil.robots.go2.gait import GRAVITY_MPS2
 from sim_hil.robots.go2.sport import SportAction
 from sim_hil.robots.interface import BaseTruth, Robot
-from sim_hil.scene.scene import Box, Scene
-from sim_hil.scene.terrain import ConvexPiece
+from sim_hil.scene.scene import Box, Scene, Terrain
 from sim_hil.simulation.person_body import PersonBody
 from sim_hil.world.drawing.stage import BulletStage
 from sim_hil.world.scene_meshes import build_scene
@@ -87,7 +86,7 @@ class Simulation:
         self._contact_every = max(1, round(_CONTACT_S * rate_hz))
         self._touched: dict[str, int] = {}  # label -> the latest step in which it was touched
         self._contacts: dict[str, int] = {}  # the same without those who were only near
-        self._fell = False
+        self.fell = False  # whether the robot has ever tilted by more than 60 degrees
         self.client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
         """PyBullet's `physicsClientId` of this world."""
         try:
@@ -108,8 +107,8 @@ class Simulation:
         # The floor reaches beyond the walls, so that nothing can ever fall off the world.
         ground = Box(((x0 + x1) / 2, (y0 + y1) / 2, -0.5), (1.0, 0.0), (x1 - x0 + 10, y1 - y0 + 10, 1.0))
         self._floor = self._static(ground, friction=_FOOTING)
-        for piece in scene.terrain_pieces():
-            self._raised(piece)
+        for terrain in scene.terrain:
+            self._raised(terrain)
         self._solids = self._obstacles(scene.obstacles())
         self._aside = (x1 + 50.0, y1 + 50.0)
         shape = pybullet.createCollisionShape(
@@ -130,7 +129,7 @@ class Simulation:
             build_scene(stage, scene)
             looks = appearances(len(self._walkers), self._seed, scene.name)
             self._looks = [PersonBody(stage, look) for look in looks]
-        self._robot = self._load(robot, folder)
+        self.robot = self._load(robot, folder)
         self._place_people()
 
     def _load(self, robot: str, folder: Path) -> Robot:
@@ -170,17 +169,15 @@ class Simulation:
             solids[self._immovable(shape, (0, 0, 0), (0, 0, 0, 1), _SIDES)] = group
         return solids
 
-    def _raised(self, piece: ConvexPiece) -> int:
-        corners = np.array(piece.vertices_m)
+    def _raised(self, terrain: Terrain) -> None:
+        corners = np.array(terrain.vertices_m())
         middle = corners.mean(axis=0)
         shape = pybullet.createCollisionShape(
             pybullet.GEOM_MESH, vertices=(corners - middle).tolist(), physicsClientId=self.client
         )
-        return self._immovable(shape, tuple(middle.tolist()), (0, 0, 0, 1), _FOOTING)
+        self._immovable(shape, tuple(middle.tolist()), (0, 0, 0, 1), _FOOTING)
 
-    def _immovable(
-        self, shape: int, position: tuple[float, ...], turn: tuple[float, ...], friction: float
-    ) -> int:  # fmt: skip
+    def _immovable(self, shape: int, position: tuple[float, ...], turn: tuple[float, ...], friction: float) -> int:
         client = self.client
         # As a plain rigid body: a multi-body that cannot move would be solved for in every step all the same.
         body = int(
@@ -209,7 +206,7 @@ class Simulation:
         if self._looks:
             for look, row in zip(self._looks, self._walkers.render_rows(), strict=False):
                 look.pose(row)
-        (x, y, _), _ = self._robot.pose()
+        (x, y, _), _ = self.robot.pose()
         gaps = np.hypot(self._people[:, 0] - x, self._people[:, 1] - y)
         near = np.flatnonzero(gaps < _NEAR_M)
         if len(near) > len(self._person_bodies):
@@ -231,9 +228,9 @@ class Simulation:
 
         It advances `time_s`; contacts meanwhile do not count.
         """
-        self._robot.stand()
+        self.robot.stand()
         for _ in range(round(_SETTLE_S * self.rate_hz)):
-            if self._robot.ready:
+            if self.robot.ready:
                 self._touched.clear()
                 self._contacts.clear()
                 return
@@ -244,7 +241,7 @@ class Simulation:
         """Advance the world by dt_s. Raises SimulationClosedError if the physics client no longer exists."""
         try:
             if self._walkers_due() and len(self._walkers):
-                (x, y, _), heading = self._robot.pose()
+                (x, y, _), heading = self.robot.pose()
                 self._walkers.step(x, y, heading)
                 self._people = self._walkers.poses()
                 self._place_people()
@@ -257,9 +254,9 @@ class Simulation:
         return self._steps * UPDATE_HZ // self.rate_hz != (self._steps - 1) * UPDATE_HZ // self.rate_hz
 
     def _physics(self) -> None:
-        self._robot.drive()
+        self.robot.drive()
         pybullet.stepSimulation(physicsClientId=self.client)
-        self._robot.observe()
+        self.robot.observe()
         self._steps += 1
         if self._steps % self._contact_every == 0:
             self._watch()
@@ -274,7 +271,7 @@ class Simulation:
 
     def _watch(self) -> None:
         labels = set()
-        for contact in pybullet.getContactPoints(bodyA=self._robot.body, physicsClientId=self.client):
+        for contact in pybullet.getContactPoints(bodyA=self.robot.body, physicsClientId=self.client):
             # The engine also lists objects that are up to 2 cm away.
             if contact[9] > 0.0 or contact[8] < 0.0:
                 if contact[2] in self._is_person:
@@ -282,18 +279,13 @@ class Simulation:
                 elif contact[2] in self._solids:
                     labels.add(_nearest_label(self._solids[contact[2]], contact[6]))
         self._contacts.update((label, self._steps) for label in labels)
-        (x, y, _), _ = self._robot.pose()
+        (x, y, _), _ = self.robot.pose()
         if len(self._people) and bool(
             np.any(np.hypot(self._people[:, 0] - x, self._people[:, 1] - y) < PERSON_COLLISION_M)
         ):
             labels.add("person")
         self._touched.update((label, self._steps) for label in labels)
-        self._fell = self._fell or self._robot.up() < 0.5
-
-    @property
-    def robot(self) -> Robot:
-        """The robot, for functions that only its own protocol needs."""
-        return self._robot
+        self.fell = self.fell or self.robot.up() < 0.5
 
     @property
     def time_s(self) -> float:
@@ -302,38 +294,34 @@ class Simulation:
 
     def command(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
         """Command a body-frame velocity, valid for 1 s of simulation time; ignored unless the robot is ready."""
-        self._robot.command(vx_mps, vy_mps, wz_radps)
+        self.robot.command(vx_mps, vy_mps, wz_radps)
 
     def sport(self, action: SportAction) -> int:
         """Request an action of a Go2's sport controller; return 0 or a Unitree error code.
 
         Raises ValueError for a robot without sport controller.
         """
-        if not isinstance(self._robot, Go2):
-            raise ValueError(f"simulation: sport actions are the Go2's, this robot is a {type(self._robot).__name__}")
-        return self._robot.sport.request(action)
-
-    def move(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
-        """Alias of `command` with the name of the Go2's sport service."""
-        self.command(vx_mps, vy_mps, wz_radps)
+        if not isinstance(self.robot, Go2):
+            raise ValueError(f"simulation: sport actions are the Go2's, this robot is a {type(self.robot).__name__}")
+        return self.robot.sport.request(action)
 
     @property
     def commanded(self) -> tuple[float, float, float]:
         """Velocity command in force; zero if the robot may not move or the last command has expired."""
-        if isinstance(self._robot, Go2):
-            return self._robot.sport.commanded
-        return self._robot.truth(self.time_s).commanded
+        if isinstance(self.robot, Go2):
+            return self.robot.sport.commanded
+        return self.robot.truth(self.time_s).commanded
 
     def truth(self) -> BaseTruth:
         """Ground truth of the robot now (a Go2's is a RobotTruth). Raises SimulationClosedError."""
         try:
-            return self._robot.truth(self.time_s)
+            return self.robot.truth(self.time_s)
         except pybullet.error as error:
             raise self._explained(error) from error
 
     def pose(self) -> tuple[tuple[float, float, float], float]:
         """Return base position, m, and heading, rad; cheaper than `truth`."""
-        return self._robot.pose()
+        return self.robot.pose()
 
     def people(self) -> NDArray[np.float64]:
         """Return the pose of every person [n, 3]: x m, y m, heading rad."""
@@ -365,14 +353,9 @@ class Simulation:
         since = self._steps - _TOUCHING_S * self.rate_hz
         return frozenset(label for label, step in steps.items() if step > since)
 
-    @property
-    def fell(self) -> bool:
-        """Whether the robot has ever tilted by more than 60 degrees."""
-        return self._fell
-
     def render_state(self) -> NDArray[np.float64]:
         """Return the render state [robot fields + RENDER_FIELDS n]: the robot's, then every person's row."""
-        robot = np.array(self._robot.render_state())
+        robot = np.array(self.robot.render_state())
         return np.concatenate((robot, self._walkers.render_rows().reshape(len(self._walkers) * RENDER_FIELDS)))
 
     def close(self) -> None:

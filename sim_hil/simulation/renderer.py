@@ -159,9 +159,8 @@ class Renderer:
         return output, texture
 
     def _texture(self, image: Image) -> core.Texture:
-        known = self._textures.get(id(image))
-        if known is not None:
-            return known[1]
+        if id(image) in self._textures:
+            return self._textures[id(image)][1]
         height, width = (_power_of_two(size) for size in image.shape[:2])
         fitted = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
         texture = core.Texture()

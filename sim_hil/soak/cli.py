@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -24,21 +23,18 @@ from edge.core.cli import (
     write_result,
 )
 from firmware_bridge.core.config import load_robot_config
+from reporting.progress import Progress
 from sim_hil.realtime.children import StepError
-from sim_hil.realtime.stack import COMMANDS, ROBOT_FILE, free_domain
+from sim_hil.realtime.stack import ROBOT_FILE, free_domain
 from sim_hil.robots.odometry_noise import LEVELS
 from sim_hil.scene.scene import SceneError, load_scene
-from sim_hil.soak.drive import schedule
-from sim_hil.soak.drive.schedule import FaultMenu, SoakInputError
+from sim_hil.soak.faults import DEFAULT_MENU, SoakInputError, load_menu
 from sim_hil.soak.report import write_report
 from sim_hil.soak.run import SoakFolder, SoakOptions, run_legs, soak_result
-from sim_hil.soak.verdict import budget as budgets
-from sim_hil.soak.verdict.budget import PASS, UNDECIDED, BudgetLine
-from sim_hil.soak.verdict.measures import names
-from sim_hil.soak.verdict.moments import keep_moments
+from sim_hil.soak.verdict import DEFAULT_BUDGET, PASS, UNDECIDED, applicable, load_budget
 
 MODES: Final = ("async", "sync", "no-reasoning")
-PLAIN_S: Final = 30.0
+STATUS_PERIOD_S: Final = 30.0
 UNTRAINED_MPS: Final = 0.14
 """Default speed limit for untrained weights, m/s: they drive into walls, which below 0.2 m/s (edge.odometry.gate) does
 not end the run, so that the growth of the runner can be measured."""
@@ -51,7 +47,7 @@ EXAMPLES = """examples:
   edge-soak --artifacts out/nano --duration 5m --faults none --json - --out out/quick
 
 A leg is one run of the stack (edge-hil, edge-bridge, edge-run) in one scene, with one task after another.
-Default budget and faults: sim_hil/soak/verdict/budget.toml and sim_hil/soak/drive/faults.toml; copy and change them.
+Default budget and faults: sim_hil/soak/budget.toml and sim_hil/soak/faults.toml; copy and change them.
 exit codes: 0 budget met, 1 budget exceeded, undecided, or no leg could run, 2 bad arguments or input,
             3 refused (artifacts), 130 interrupted (a report of the finished part is written)
 """
@@ -113,16 +109,16 @@ def parse_seconds(text: str) -> float:
 
 
 @command_line("edge-soak")
-def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]] = COMMANDS) -> int:
+def main(argv: Sequence[str] | None = None) -> int:
     """Run the command and return its exit code (see EXAMPLES)."""
     args = parser().parse_args(argv)
     try:
         check_result_target(args.json)
         options = options_of(args)
-        menu = _menu(args.faults)
-        budget = budgets.load_budget(args.budget or budgets.DEFAULT)
-        budgets.check_names(budget, names())
-        budget = budgets.applicable(budget, faults=menu is not None)
+        menus = {"none": None, "default": DEFAULT_MENU}
+        menu_file = menus.get(args.faults, Path(args.faults))
+        menu = None if menu_file is None else load_menu(menu_file)
+        budget = applicable(load_budget(args.budget or DEFAULT_BUDGET), faults=menu is not None)
         soak = (SoakFolder.resume if args.resume else SoakFolder.create)(args.out.absolute(), options)
     except ArtifactError as error:
         return _report_error(error, EXIT_REFUSED)
@@ -134,17 +130,21 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]
             f"speed limit {options.speed_mps:g} m/s"
         )
     with stop_signals() as stop:
-        progress, failure = _Progress(), ""
+        failure = ""
         try:
-            finished = run_legs(
-                soak, options, menu, stopped=lambda: bool(stop), show_status=progress.status, log=progress.log,
-                keep_logs=args.keep_logs, commands=commands, after_leg=keep_moments,
-            )  # fmt: skip
+            with Progress("edge-soak: ", period_s=STATUS_PERIOD_S) as progress:
+                finished = run_legs(
+                    soak, options, menu, stopped=lambda: bool(stop), show_status=progress.show, log=progress.say,
+                    keep_logs=args.keep_logs,
+                )  # fmt: skip
         except (StepError, ValueError) as error:
             finished, failure = False, str(error)
-        progress.end()
         result = soak_result(soak, options, budget, finished=finished)
-        _write(args, soak, options, result, budget)
+        write_result(str(soak.path / "result.json"), result)
+        write_result(args.json, result)
+        _print(str(write_report(soak, result)))
+        if args.json != "-":
+            sys.stdout.write(summary_lines(result))
     if failure:
         return _report_error(failure, EXIT_CHECK_FAILED)
     if not finished:
@@ -192,26 +192,6 @@ def options_of(args: argparse.Namespace) -> SoakOptions:
     )
 
 
-def _menu(faults: str) -> FaultMenu | None:
-    if faults == "none":
-        return None
-    return schedule.load_menu(schedule.DEFAULT if faults == "default" else Path(faults))
-
-
-def _write(
-    args: argparse.Namespace,
-    soak: SoakFolder,
-    options: SoakOptions,
-    result: Mapping[str, object],
-    budget: Sequence[BudgetLine],
-) -> None:
-    write_result(str(soak.path / "result.json"), result)
-    write_result(args.json, result)
-    _print(str(write_report(soak, result)))
-    if args.json != "-":
-        sys.stdout.write(summary_lines(result))
-
-
 def summary_lines(result: Mapping[str, Any]) -> str:
     """Format the verdict and the budget's lines for the terminal."""
     rows = []
@@ -219,7 +199,8 @@ def summary_lines(result: Mapping[str, Any]) -> str:
         limit = f"<= {line['max']:g}" if "max" in line else f">= {line['min']:g}"
         value = line["found"]["value"]
         found = "–" if value is None else f"{value:g} {line['found']['unit']}"
-        rows.append(f"{line['verdict']:<10}{line['measure']:<38}{found:>18}  {limit}" + _why(line))
+        why = f"  ({line['why']})" if "why" in line else ""
+        rows.append(f"{line['verdict']:<10}{line['measure']:<38}{found:>18}  {limit}{why}")
     legs = result["legs"]
     tasks, reached = sum(leg["tasks"] for leg in legs), sum(leg["reached"] for leg in legs)
     rows.append(
@@ -227,35 +208,6 @@ def summary_lines(result: Mapping[str, Any]) -> str:
         f"{sum(leg['stops'] for leg in legs)} stops, {sum(leg['faults'] for leg in legs)} faults"
     )
     return "\n".join(rows) + "\n"
-
-
-def _why(line: Mapping[str, object]) -> str:
-    return f"  ({line['why']})" if "why" in line else ""
-
-
-class _Progress:
-    """Status line on stderr: redrawn on a terminal, otherwise printed every PLAIN_S seconds."""
-
-    def __init__(self) -> None:
-        self._printed_ns = 0
-        self._terminal = sys.stderr.isatty()
-
-    def status(self, line: str) -> None:
-        now_ns = time.monotonic_ns()
-        if self._terminal:
-            sys.stderr.write(f"\r\x1b[Kedge-soak: {line}")
-            sys.stderr.flush()
-        elif now_ns - self._printed_ns >= PLAIN_S * 1e9:
-            self._printed_ns = now_ns
-            _print(line)
-
-    def log(self, line: str) -> None:
-        self.end()
-        _print(line)
-
-    def end(self) -> None:
-        if self._terminal:
-            sys.stderr.write("\r\x1b[K")
 
 
 def _print(line: str) -> None:

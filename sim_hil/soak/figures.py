@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import cv2
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from reporting.plot_style import BAD, COMMAND, INK, MUTED, PERSON, TRUTH, legend_above, new_figure, png, tidy
 from sim_hil.scene.map import draw_map, draw_mark, draw_path, map_view
 from sim_hil.scene.scene import Scene
-from sim_hil.soak.verdict.measures import BRIDGE_PERIOD_MS, MIB
+from sim_hil.soak.verdict import BRIDGE_PERIOD_MS, MIB, process_lives
 
 Array = NDArray[np.float64]
 Analysis = Mapping[str, Any]
@@ -99,29 +99,17 @@ def processes(legs: Sequence[Analysis], samples: Sequence[Samples]) -> bytes:
     for each, (key, unit, label) in zip(axes, panels, strict=True):
         for name, colour in _COLOURS.items():
             shown = name
-            for at, values in _lives(legs, samples, name, key, unit):
-                each.plot(at, values, color=colour, linewidth=1.0, label=shown)
-                shown = "_"
+            for offset_s, leg in zip(offsets_s(legs), samples, strict=True):
+                for times, values in process_lives(leg, name, key):
+                    at, scaled = (np.array(times) + offset_s) / 60, np.array(values) / unit
+                    each.plot(at, scaled, color=colour, linewidth=1.0, label=shown)
+                    shown = "_"
         each.set_ylabel(label, fontsize=9)
         each.set_ylim(bottom=0)
         tidy(each)
     legend_above(axes[0])
     axes[-1].set_xlabel("minutes of the soak", fontsize=9)
     return png(figure)
-
-
-def _lives(
-    legs: Sequence[Analysis], samples: Sequence[Samples], name: str, key: str, unit: float
-) -> Iterator[tuple[Array, Array]]:
-    for offset_s, leg in zip(offsets_s(legs), samples, strict=True):
-        lives: dict[int, list[tuple[float, float]]] = {}
-        for sample in leg:
-            row = sample["processes"].get(name)
-            if row is not None:
-                lives.setdefault(row["pid"], []).append(((offset_s + sample["elapsed_s"]) / 60, row[key] / unit))
-        for life in lives.values():
-            at, values = np.array(life).T
-            yield at, values
 
 
 def histograms(legs: Sequence[Analysis]) -> bytes:

@@ -10,13 +10,13 @@ import numpy as np
 
 from edge.core.cli import write_whole
 from edge.core.stats import percentiles
-from reporting import page
+from reporting.page import Cell, Figure, Table, mark, render
 from reporting.plot_style import delay_histogram
 from sim_hil.scene.scene import SceneError, load_scene
 from sim_hil.soak import figures
+from sim_hil.soak.analysis import Moment, read_moments
 from sim_hil.soak.run import SoakFolder
-from sim_hil.soak.verdict.budget import FAIL, PASS, UNDECIDED
-from sim_hil.soak.verdict.moments import Moment, read_moments
+from sim_hil.soak.verdict import FAIL, PASS, UNDECIDED
 
 REPORT: Final = "report.html"
 SHOWN_MAPS: Final = 12
@@ -27,84 +27,75 @@ def write_report(soak: SoakFolder, result: Mapping[str, Any]) -> Path:
     """Write the page into the soak's folder and return its path. Raises OSError."""
     path = soak.path / REPORT
     samples = soak.samples()
-    parts = [
-        "<h1>Soak</h1>",
-        _verdict(result),
-        _untrained(result),
-        page.tiles(_headline(result)),
-        "<h2>Budget</h2>",
-        _budget(result["budget"]),
-    ]
-    if any(leg["lives"] for leg in soak.legs):
-        delays = [v for leg in soak.legs for life in leg["lives"] for v in life["delay_s"] if v is not None]
-        parts += [
-            "<h2>Time</h2>",
-            page.figure(
-                figures.timing(soak.legs),
-                "Ticks, delay, generations and jitter over time",
-                "Median and maximum of each window (measured). Orange: a fault was active; red lines: the runner "
-                "stopped permanently; dotted: a new leg.",
-                wide=True,
-            ),
-            '<div class="pair">',
-            page.figure(figures.histograms(soak.legs), "Histograms of ticks and jitter", "All ticks and commands."),
-            page.figure(delay_histogram(np.array(delays, float)), "Histogram of the delay", "Δt of all ticks."),
-            "</div>",
-        ]
-    if any(samples):
-        parts += [
-            "<h2>Processes</h2>",
-            page.figure(
-                figures.processes(soak.legs, samples),
-                "Memory, descriptors and CPU",
-                "Sampled once a second; each line is one process from start to end.",
-                wide=True,
-            ),
-        ]
-    if any(leg["lives"] for leg in soak.legs):
-        parts.append(
-            page.figure(
-                figures.drift_and_battery(soak.legs),
-                "Drift and battery",
-                "Drift: the runner's estimate against ground truth, without segments disturbed by injected faults. "
-                "The battery is the simulated robot's.",
-            )
+    stops = _stops(soak.legs)
+    lived = any(leg["lives"] for leg in soak.legs)
+    page = render(
+        "soak",
+        title="Soak",
+        passed=result["verdict"] == PASS,
+        verdict=result["verdict"],
+        text=_verdict_text(result),
+        finished=result["finished"],
+        elapsed_s=result["elapsed_s"],
+        asked_s=result["asked_s"],
+        trained=result["options"]["trained"],
+        tiles=_headline(result),
+        budget=_budget(result["budget"]),
+        **(_run_figures(soak.legs) if lived else dict.fromkeys(("timing", "histograms", "drift"))),
+        processes=Figure(
+            figures.processes(soak.legs, samples),
+            "Memory, descriptors and CPU",
+            "Sampled once a second; each line is one process from start to end.",
+            wide=True,
         )
-    parts += [
-        _faults(soak.legs),
-        _moments(soak),
-        *_maps(soak.legs),
-        _stops(soak.legs),
-        _legs(result),
-        _measures(result),
-    ]
-    write_whole(path, page.document("Soak", "\n".join(part for part in parts if part)))
+        if any(samples)
+        else None,
+        faults=_faults(soak.legs),
+        moments=_moments(soak),
+        maps=_maps(soak.legs),
+        stops=Table(("leg", "s", "attributed to", "the runner's message"), stops[:SHOWN_STOPS], frozenset({0, 1})),
+        stop_count=len(stops),
+        legs=_legs(result),
+        measures=Table(
+            ("measure", "found", "n", ""),
+            [(name, _value(found), str(found["count"]), found["tagged"]) for name, found in result["measures"].items()],
+            numeric=frozenset({1, 2}),
+        ),
+    )
+    write_whole(path, page)
     return path
 
 
-def _verdict(result: Mapping[str, Any]) -> str:
-    kind = "good" if result["verdict"] == PASS else "bad"
+def _run_figures(legs: Sequence[Mapping[str, Any]]) -> dict[str, object]:
+    """Return the figures of the lives of the runner."""
+    delays = [v for leg in legs for life in leg["lives"] for v in life["delay_s"] if v is not None]
+    return {
+        "timing": Figure(
+            figures.timing(legs),
+            "Ticks, delay, generations and jitter over time",
+            "Median and maximum of each window (measured). Orange: a fault was active; red lines: the runner "
+            "stopped permanently; dotted: a new leg.",
+            wide=True,
+        ),
+        "histograms": [
+            Figure(figures.histograms(legs), "Histograms of ticks and jitter", "All ticks and commands."),
+            Figure(delay_histogram(np.array(delays, float)), "Histogram of the delay", "Δt of all ticks."),
+        ],
+        "drift": Figure(
+            figures.drift_and_battery(legs),
+            "Drift and battery",
+            "Drift: the runner's estimate against ground truth, without segments disturbed by injected faults. "
+            "The battery is the simulated robot's.",
+        ),
+    }
+
+
+def _verdict_text(result: Mapping[str, Any]) -> str:
     lines = result["budget"]
     undecided = sum(line["verdict"] not in (PASS, FAIL) for line in lines)
     count = f"{undecided} of {len(lines)} budget lines are undecided"
     texts = {FAIL: "the budget is exceeded", PASS: "the budget is met", UNDECIDED: f"no verdict: {count}"}
-    text = texts[result["verdict"]]
-    more = f"; {count}" if undecided and result["verdict"] == FAIL else ""
-    cut = "" if result["finished"] else f" It ended after {result['elapsed_s']:.0f} of {result['asked_s']:.0f} s."
-    return (
-        f'<p><span class="verdict {kind}">{result["verdict"]}</span> {text}{more}.{cut}</p>'
-        '<p class="quiet">Positions, contacts and success are ground truth, not the robot\'s odometry. '
-        "All numbers are measured on this machine unless tagged as modelled.</p>"
-    )
-
-
-def _untrained(result: Mapping[str, Any]) -> str:
-    if result["options"]["trained"]:
-        return ""
-    return (
-        '<p class="notice"><b>The weights are untrained</b>: the robot moves but does not navigate. Success and '
-        "collisions below are meaningless; timing, memory, faults and stops are valid.</p>"
-    )
+    return texts[result["verdict"]] + (f"; {count}" if undecided and result["verdict"] == FAIL else "")
 
 
 def _headline(result: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -130,39 +121,36 @@ def _headline(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def _budget(lines: Sequence[Mapping[str, Any]]) -> str:
+def _budget(lines: Sequence[Mapping[str, Any]]) -> Table:
     rows = []
     for line in lines:
-        mark = {PASS: '<span class="pass">PASS</span>', FAIL: '<span class="fail">FAIL</span>'}
+        verdict = line["verdict"]
         limit = f"≤ {line['max']:g}" if "max" in line else f"≥ {line['min']:g}"
-        why = page.text_html(line.get("why", ""))
         rows.append(
             (
-                mark.get(line["verdict"], "undecided"),
-                page.text_html(line["measure"]),
+                mark(verdict == PASS, verdict) if verdict in (PASS, FAIL) else "undecided",
+                line["measure"],
                 _value(line["found"]),
                 limit,
                 str(line["found"]["count"]),
-                page.text_html(line["source"]) + (f"<br>{why}" if why else ""),
+                Cell(line["source"], note=line.get("why", "")),
             )
         )
-    return page.table(("", "measure", "found", "limit", "n", "source"), rows, numeric=frozenset({2, 3, 4}))
+    return Table(("", "measure", "found", "limit", "n", "source"), rows, numeric=frozenset({2, 3, 4}))
 
 
 def _value(found: Mapping[str, Any]) -> str:
     if found["value"] is None:
         return "–"
     span = f" [{found['low']:g}, {found['high']:g}]" if "low" in found and "high" in found else ""
-    return f"{found['value']:g}{span} {page.text_html(found['unit'])}".strip()
+    return f"{found['value']:g}{span} {found['unit']}".strip()
 
 
-def _faults(legs: Sequence[Mapping[str, Any]]) -> str:
+def _faults(legs: Sequence[Mapping[str, Any]]) -> Table:
     kinds: dict[str, list[Mapping[str, Any]]] = {}
     for leg in legs:
         for fault in leg["faults"]:
             kinds.setdefault(fault["name"], []).append(fault)
-    if not kinds:
-        return ""
     rows = []
     for name, faults in sorted(kinds.items()):
         times = [
@@ -174,24 +162,21 @@ def _faults(legs: Sequence[Mapping[str, Any]]) -> str:
         watched = faults[0]["fault"]
         rows.append(
             (
-                page.text_html(name),
+                name,
                 str(len(faults)),
-                page.text_html(faults[0]["expect"]),
-                page.text_html(watched or "–"),
+                faults[0]["expect"],
+                watched or "–",
                 f"{len(times)} of {len(faults)}" if watched else "–",
                 "–" if points["p50"] is None else f"{points['p50']:.0f}",
                 "–" if points["max"] is None else f"{points['max']:.0f}",
             )
         )
     head = ("fault", "n", "expected action", "raises", "raised", "p50 ms", "max ms")
-    return (
-        "<h2>Faults</h2><p>Times are from the fault's effect on the robot's side to the runner's own record of it; "
-        "<code>make faults</code> measures how soon the robot stands.</p>"
-        + page.table(head, rows, numeric=frozenset({1, 4, 5, 6}))
-    )
+    return Table(head, rows, numeric=frozenset({1, 4, 5, 6}))
 
 
-def _moments(soak: SoakFolder) -> str:
+def _moments(soak: SoakFolder) -> list[dict[str, object]]:
+    """Return the worst moment of each kind that has an animation."""
     found: dict[str, tuple[Moment, Path, int]] = {}
     for leg in soak.legs:
         number = leg["leg"]["number"]
@@ -199,69 +184,50 @@ def _moments(soak: SoakFolder) -> str:
             known = found.get(moment.kind)
             if moment.gif and (known is None or moment.rank > known[0].rank):
                 found[moment.kind] = (moment, soak.folder(number) / moment.gif, number)
-    cards = []
+    shown: list[dict[str, object]] = []
     for moment, path, number in found.values():
         try:
-            uri = page.image_uri(path.read_bytes(), "gif")
+            gif = path.read_bytes()
         except OSError:
             continue  # the file was deleted
-        cards.append(
-            f'<figure><img src="{uri}" alt="{page.text_html(moment.kind)}"><div class="meta"><b>'
-            f"{page.text_html(moment.kind)}</b>, leg {number}: {page.text_html(moment.what, limit=200)}</div></figure>"
-        )
-    if not cards:
-        return ""
-    return (
-        f'<h2>Worst moments</h2><p>The robot\'s camera in the 5 s before.</p><div class="sheet">{"".join(cards)}</div>'
-    )
+        shown.append({"kind": moment.kind, "gif": gif, "leg": number, "text": moment.what})
+    return shown
 
 
-def _maps(legs: Sequence[Mapping[str, Any]]) -> list[str]:
-    parts = ["<h2>Paths</h2>"] if legs else []
+def _maps(legs: Sequence[Mapping[str, Any]]) -> list[Figure | str]:
+    """Return the maps of some legs, or the name of a scene that is not on this machine."""
+    maps: list[Figure | str] = []
     step = max(1, len(legs) // SHOWN_MAPS)
     for leg in legs[::step][:SHOWN_MAPS]:
         name, number = leg["leg"]["stack"]["scene"], leg["leg"]["number"]
         try:
             picture = figures.leg_map(load_scene(name), leg)
         except SceneError:
-            parts.append(f"<p>Scene {page.text_html(name)} is not on this machine: no map.</p>")
+            maps.append(name)
             continue
         caption = (
             f"Leg {number}, {name}, {leg['elapsed_s']:.0f} s, ended by: {leg['why']}. Blue: true path from its disc; "
             "green ring: goal reached; grey ring: goal not reached; orange: a fault; red: a permanent stop."
         )
-        parts.append(page.figure(picture, f"Map of leg {number}", caption, wide=True))
-    return parts
+        maps.append(Figure(picture, f"Map of leg {number}", caption, wide=True))
+    return maps
 
 
-def _stops(legs: Sequence[Mapping[str, Any]]) -> str:
-    rows = []
+def _stops(legs: Sequence[Mapping[str, Any]]) -> list[tuple[str | Cell, ...]]:
+    rows: list[tuple[str | Cell, ...]] = []
     for leg in legs:
         for end in leg["life_ends"]:
             if end["cause"] == "leg":
                 continue
             at_s = (end["t_ns"] - leg["begin_ns"]) / 1e9
             why = end["cause"] or f"ended with code {end['code']}"
-            explained = end["explained"] or '<span class="fail">unexplained</span>'
-            cause = page.text_html(end["explained"]) if end["explained"] else explained
-            rows.append((str(leg["leg"]["number"]), f"{at_s:.0f}", cause, page.text_html(why, limit=300)))
-    if not rows:
-        return ""
-    head = ("leg", "s", "attributed to", "the runner's message")
-    more = f"<p>The first {SHOWN_STOPS} of {len(rows)}.</p>" if len(rows) > SHOWN_STOPS else ""
-    return "<h2>Permanent stops</h2>" + more + page.table(head, rows[:SHOWN_STOPS], numeric=frozenset({0, 1}))
+            cause = end["explained"] or mark(False, "unexplained")
+            rows.append((str(leg["leg"]["number"]), f"{at_s:.0f}", cause, why))
+    return rows
 
 
-def _legs(result: Mapping[str, Any]) -> str:
+def _legs(result: Mapping[str, Any]) -> Table:
     head = ("leg", "scene", "s", "tasks", "reached", "collided", "stops", "faults", "ended by")
     keys = ("number", "scene", "elapsed_s", "tasks", "reached", "collided", "stops", "faults", "why")
-    rows = [[page.text_html(str(leg[key]), limit=200) for key in keys] for leg in result["legs"]]
-    return "<h2>Legs</h2>" + page.table(head, rows, numeric=frozenset({0, 2, 3, 4, 5, 6, 7}))
-
-
-def _measures(result: Mapping[str, Any]) -> str:
-    rows = [
-        (page.text_html(name), _value(found), str(found["count"]), page.text_html(found["tagged"]))
-        for name, found in result["measures"].items()
-    ]
-    return "<h2>All measures</h2>" + page.table(("measure", "found", "n", ""), rows, numeric=frozenset({1, 2}))
+    rows = [[str(leg[key]) for key in keys] for leg in result["legs"]]
+    return Table(head, rows, numeric=frozenset({0, 2, 3, 4, 5, 6, 7}))

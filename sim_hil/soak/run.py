@@ -14,17 +14,16 @@ import numpy as np
 from edge.core.cli import write_whole
 from edge.core.stats import percentiles
 from edge.flightlog.recorder import space_refusal
-from sim_hil.protocols.fault_client import FaultError
+from sim_hil.protocols.fault_socket import FaultError
 from sim_hil.realtime.children import StepError
-from sim_hil.realtime.stack import COMMANDS, StackOptions
+from sim_hil.realtime.stack import StackOptions
 from sim_hil.realtime.truth import read_lines
-from sim_hil.scene.scene import load_scene
-from sim_hil.soak.drive.journey import Journey
-from sim_hil.soak.drive.leg import LEG, SAMPLES, Leg, LegOptions
-from sim_hil.soak.drive.schedule import FaultMenu, SoakInputError
-from sim_hil.soak.verdict.analysis import ANALYSIS, analyse
-from sim_hil.soak.verdict.budget import FAIL, PASS, UNDECIDED, BudgetLine, Judgement, judge
-from sim_hil.soak.verdict.measures import measures
+from sim_hil.scene.scene import Vec3, load_scene
+from sim_hil.soak.analysis import ANALYSIS, analyse, keep_moments
+from sim_hil.soak.faults import FaultMenu, SoakInputError
+from sim_hil.soak.leg import LEG, SAMPLES, Leg, LegOptions
+from sim_hil.soak.tasks import Journey
+from sim_hil.soak.verdict import FAIL, PASS, UNDECIDED, BudgetLine, judge, measures
 
 CONFIG: Final = "config.json"
 LEGS: Final = "legs"
@@ -149,8 +148,6 @@ def run_legs(
     show_status: PrintLine,
     log: PrintLine,
     keep_logs: bool = False,
-    commands: Mapping[str, Sequence[str]] = COMMANDS,
-    after_leg: Callable[[Path, dict[str, Any]], None] = lambda folder, analysis: None,
 ) -> bool:
     """Run legs until the time is over; return False if `stopped` ended it.
 
@@ -164,7 +161,11 @@ def run_legs(
         number = 1 + max((leg["leg"]["number"] for leg in soak.legs), default=0)
         folder = soak.folder(number)
         folder.mkdir(parents=True, exist_ok=True)
-        leg = _leg(options, number, folder, min(options.leg_s, left_s), menu, stopped, show_status, commands)
+        scene = options.scenes[(number - 1) % len(options.scenes)]
+        journey = Journey(load_scene(scene), options.seed, number, options.speed_mps)
+        stack = _stack_options(options, number, folder, scene, journey.begin(), faults=menu is not None)
+        leg_options = LegOptions(number, options.seed, min(options.leg_s, left_s), options.speed_mps, stack)
+        leg = Leg(leg_options, journey, menu, stopped=stopped, show_status=show_status)
         try:
             why = leg.run()
             failed = 0
@@ -175,7 +176,7 @@ def run_legs(
                 raise StepError(f"{FAILED_LEGS} legs in a row failed, the last one: {error}") from error
         log(f"leg {number} ended: {why}; {leg.reached} of {leg.tasks} tasks reached, {leg.stops} stops")
         analysis = analyse(folder)
-        after_leg(folder, analysis)
+        keep_moments(folder, analysis)
         soak.legs.append(analysis)
         if not keep_logs:
             for flight_log in folder.glob("flight-*.mcap"):
@@ -183,23 +184,14 @@ def run_legs(
     return False
 
 
-def _leg(
-    options: SoakOptions,
-    number: int,
-    folder: Path,
-    duration_s: float,
-    menu: FaultMenu | None,
-    stopped: Callable[[], bool],
-    show_status: PrintLine,
-    commands: Mapping[str, Sequence[str]],
-) -> Leg:
-    scene = options.scenes[(number - 1) % len(options.scenes)]
-    journey = Journey(load_scene(scene), options.seed, number, options.speed_mps)
-    stack = StackOptions(
+def _stack_options(
+    options: SoakOptions, number: int, folder: Path, scene: str, start: Vec3, *, faults: bool
+) -> StackOptions:
+    return StackOptions(
         folder=folder,
         artifacts=options.artifacts,
         scene=scene,
-        start=journey.begin(),
+        start=start,
         people=options.people,
         seed=int(np.random.default_rng((options.seed, 63, number)).integers(2**31)),
         domain=options.domain,
@@ -207,31 +199,18 @@ def _leg(
         release_delay=options.release_delay,
         odometry_noise=options.odometry_noise,
         speed_limit_mps=options.speed_limit_mps,
-        faults=menu is not None,
+        faults=faults,
         instructions=True,
     )
-    return Leg(
-        LegOptions(number, options.seed, duration_s, options.speed_mps, stack),
-        journey,
-        menu,
-        stopped=stopped,
-        show_status=show_status,
-        commands=commands,
-    )
-
-
-def verdict(judgements: Sequence[Judgement]) -> str:
-    """Return FAIL if a line fails, UNDECIDED if a line is undecided or there is none, else PASS."""
-    found = {judgement.verdict for judgement in judgements}
-    return FAIL if FAIL in found else PASS if found == {PASS} else UNDECIDED
 
 
 def soak_result(
     soak: SoakFolder, options: SoakOptions, budget: Sequence[BudgetLine], *, finished: bool
 ) -> dict[str, Any]:
-    """Return the result for `--json`. Raises SoakInputError for a budget line about an unknown measure."""
+    """Return the result for `--json`."""
     found = measures(soak.legs, soak.samples())
-    judgements = judge(budget, found)
+    judged = [judge(line, found[line.measure]) for line in budget]
+    verdicts = {line["verdict"] for line in judged}
     lives = [life for leg in soak.legs for life in leg["lives"]]
     ends = [end for leg in soak.legs for end in leg["life_ends"] if end["cause"] != "leg"]
     reasons: dict[str, int] = {}
@@ -242,11 +221,11 @@ def soak_result(
     watts = [row[1] for life in lives for row in life["power"]]
     sources = sorted({row[2] for life in lives for row in life["power"]})
     return {
-        "verdict": verdict(judgements),
+        "verdict": FAIL if FAIL in verdicts else PASS if verdicts == {PASS} else UNDECIDED,
         "finished": finished,
         "elapsed_s": round(soak.elapsed_s, 1),
         "asked_s": options.duration_s,
-        "budget": [judgement.as_json() for judgement in judgements],
+        "budget": judged,
         "measures": {name: measure.as_json() for name, measure in found.items()},
         "control": {
             "ticks": sum(life["ticks"] for life in lives),

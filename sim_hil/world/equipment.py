@@ -1,17 +1,15 @@
-"""Meshes of hospital and warehouse objects, one function per kind."""
+"""Meshes of hospital and warehouse objects: every function builds the kind of object of its name."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-from sim_hil.world.drawing import prints as world_prints
+from sim_hil.world.drawing import prints
 from sim_hil.world.drawing.kit import BLACK, CARTON, DARK, STEEL, WHITE, WOOD, Kit
 from sim_hil.world.drawing.textures import Colour
 
 _RACK_BLUE = (36, 70, 140)
 
 
-def _hospital_bed(kit: Kit) -> None:
+def hospital_bed(kit: Kit) -> None:
     """The head is at the back, so that the front is the foot end."""
     kit.part((-0.44, 0.44), (-0.4, 0.4), (0.22, 0.34), STEEL)
     kit.part((-0.47, 0.47), (-0.46, 0.46), (0.40, 0.60), WHITE)
@@ -31,7 +29,7 @@ def _hospital_bed(kit: Kit) -> None:
             kit.part((x - 0.015, x + 0.015), (y - 0.03, y + 0.03), (0.13, 0.24), STEEL)
 
 
-def _wheelchair(kit: Kit) -> None:
+def wheelchair(kit: Kit) -> None:
     for y in (-0.44, 0.44):
         kit.wheel(-0.16, y, 0.31, 0.035)
         kit.wheel(-0.16, y * 1.03, 0.25, 0.03, (196, 200, 204), 0.06)
@@ -44,8 +42,8 @@ def _wheelchair(kit: Kit) -> None:
     kit.part((0.34, 0.5), (-0.34, 0.34), (0.12, 0.15), DARK)
 
 
-def _medical_cart(kit: Kit) -> None:
-    kit.part((-0.45, 0.45), (-0.45, 0.45), (0.12, 0.86), kit.paint(0.9), kit.picture(world_prints.drawers))
+def medical_cart(kit: Kit) -> None:
+    kit.part((-0.45, 0.45), (-0.45, 0.45), (0.12, 0.86), kit.paint(0.9), kit.picture(prints.drawers))
     kit.part((-0.5, 0.5), (-0.5, 0.5), (0.86, 0.90), WHITE)
     kit.part((-0.3, 0.1), (-0.35, -0.05), (0.90, 1.0), (220, 60, 50))
     kit.part((-0.2, 0.2), (0.1, 0.36), (0.90, 0.96), (230, 200, 90))
@@ -55,7 +53,7 @@ def _medical_cart(kit: Kit) -> None:
             kit.wheel(x, y, 0.06, 0.03)
 
 
-def _iv_stand(kit: Kit) -> None:
+def iv_stand(kit: Kit) -> None:
     for x, y in ((0.48, 0.07), (0.07, 0.48)):
         kit.part((-x, x), (-y, y), (0.03, 0.055), STEEL)
     for x, y in ((0.45, 0.0), (-0.45, 0.0), (0.0, 0.45), (0.0, -0.45)):
@@ -67,18 +65,18 @@ def _iv_stand(kit: Kit) -> None:
     kit.part((-0.02, 0.1), (-0.14, 0.14), (0.52, 0.66), (60, 110, 180))
 
 
-def _medical_monitor(kit: Kit) -> None:
+def medical_monitor(kit: Kit) -> None:
     for x, y in ((0.46, 0.08), (0.08, 0.46)):
         kit.part((-x, x), (-y, y), (0.03, 0.06), DARK)
     for x, y in ((0.42, 0.0), (-0.42, 0.0), (0.0, 0.42), (0.0, -0.42)):
         kit.wheel(x, y, 0.03, 0.025)
     kit.post(0, 0, (0.06, 0.72), 0.025, STEEL)
     kit.part((-0.3, 0.3), (-0.4, 0.4), (0.42, 0.47), kit.paint(0.8))
-    kit.part((-0.2, 0.25), (-0.5, 0.5), (0.72, 1.0), kit.paint(0.9), kit.picture(world_prints.heartbeat))
+    kit.part((-0.2, 0.25), (-0.5, 0.5), (0.72, 1.0), kit.paint(0.9), kit.picture(prints.heartbeat))
 
 
-def _privacy_screen(kit: Kit) -> None:
-    cloth = kit.picture(world_prints.curtain)
+def privacy_screen(kit: Kit) -> None:
+    cloth = kit.picture(prints.curtain)
     kit.part((-0.3, 0.3), (-0.5, 0.5), (0.10, 1.0), WHITE, cloth, back=cloth)
     for y in (-0.47, 0.0, 0.47):
         kit.part((-1.1, 1.1), (y - 0.01, y + 0.01), (0.0, 0.03), STEEL)
@@ -93,7 +91,7 @@ def _pallet_base(kit: Kit, x: tuple[float, float], y: tuple[float, float], z: fl
         kit.part(x, (y[0] + share * wide, y[0] + (share + 0.14) * wide), (z, z + 0.7 * high), (128, 88, 50))
 
 
-def _storage_rack(kit: Kit) -> None:
+def storage_rack(kit: Kit) -> None:
     """Uprights, beams in the rack's colour, pallets of boxes on each level, its number at both ends."""
     rng = kit.rng()
     levels = max(round(kit.height / 1.2), 2)
@@ -105,7 +103,7 @@ def _storage_rack(kit: Kit) -> None:
         for x in (-0.46, 0.46):
             kit.part((x - 0.04, x + 0.04), (y - post, y + post), (0.0, 1.0), _RACK_BLUE)
         kit.part((-0.46, 0.46), (y - post / 3, y + post / 3), (0.45, 0.48), _RACK_BLUE)
-    box = kit.picture(world_prints.carton)
+    box = kit.picture(prints.carton)
     for level in range(levels):
         z = level * step
         if level:
@@ -131,21 +129,21 @@ def _storage_rack(kit: Kit) -> None:
                 tints = ((60, 110, 170), (196, 200, 204), (170, 60, 50), (70, 140, 90))
                 kit.part((-0.40, 0.40), (low, high), (lift, lift + tall), tints[int(rng.integers(4))])
     if kit.thing.text:
-        plate = kit.picture(world_prints.aisle_plate)
+        plate = kit.picture(prints.aisle_plate)
         half, side = 0.4 / kit.height, 0.012 / kit.width
         z = min(2.0 / kit.height, 0.85)
         for low, high in ((-0.5 - 2 * side, -0.5), (0.5, 0.5 + 2 * side)):
             kit.part((-0.36, 0.36), (low, high), (z - half, z + half), DARK, sides=plate)
 
 
-def _pallet(kit: Kit) -> None:
+def pallet(kit: Kit) -> None:
     base = min(0.15 / kit.height, 0.4)
     _pallet_base(kit, (-0.5, 0.5), (-0.5, 0.5), 0.0, base)
-    boxes = kit.picture(world_prints.cartons)
+    boxes = kit.picture(prints.cartons)
     kit.part((-0.46, 0.46), (-0.46, 0.46), (base, 1.0), CARTON, boxes, boxes, boxes)
 
 
-def _empty_pallet(kit: Kit) -> None:
+def empty_pallet(kit: Kit) -> None:
     _pallet_base(kit, (-0.5, 0.5), (-0.5, 0.5), 0.0, 0.7)
     for row in range(5):
         low = -0.5 + row * 0.22
@@ -157,15 +155,15 @@ def _carton(brightness: float) -> Colour:
     return red, green, blue
 
 
-def _box_stack(kit: Kit) -> None:
-    box = kit.picture(world_prints.carton)
+def box_stack(kit: Kit) -> None:
+    box = kit.picture(prints.carton)
     spots = (((-0.5, 0.5), (-0.5, 0.0), (0.0, 0.42)), ((-0.45, 0.5), (0.04, 0.5), (0.0, 0.36)),
              ((-0.4, 0.4), (-0.34, 0.2), (0.42, 0.76)), ((-0.3, 0.3), (-0.2, 0.12), (0.76, 1.0)))  # fmt: skip
     for index, (x, y, z) in enumerate(spots):
         kit.part(x, y, z, _carton(0.9 + 0.07 * index), box, box, box)
 
 
-def _forklift(kit: Kit) -> None:
+def forklift(kit: Kit) -> None:
     yellow, dark = kit.paint(), (52, 54, 58)
     kit.part((-0.5, -0.34), (-0.46, 0.46), (0.14, 0.56), dark)
     kit.part((-0.38, 0.10), (-0.44, 0.44), (0.14, 0.34), yellow)
@@ -189,7 +187,7 @@ def _forklift(kit: Kit) -> None:
             kit.wheel(x, y * 1.02, radius * 0.5, 0.2, yellow, radius * 0.5)
 
 
-def _pallet_jack(kit: Kit) -> None:
+def pallet_jack(kit: Kit) -> None:
     red = kit.paint()
     kit.part((-0.42, -0.26), (-0.4, 0.4), (0.06, 0.34), red)
     for y in (-0.45, 0.2):
@@ -200,7 +198,7 @@ def _pallet_jack(kit: Kit) -> None:
     kit.part((-0.44, -0.38), (-0.3, 0.3), (0.90, 0.97), BLACK)
 
 
-def _traffic_cone(kit: Kit) -> None:
+def traffic_cone(kit: Kit) -> None:
     orange = kit.paint()
     kit.part((-0.5, 0.5), (-0.5, 0.5), (0.0, 0.06), kit.paint(0.8))
     bands = ((0.06, 0.37, orange), (0.36, 0.27, WHITE), (0.56, 0.20, orange), (0.70, 0.15, WHITE), (0.84, 0.10, orange))
@@ -209,7 +207,7 @@ def _traffic_cone(kit: Kit) -> None:
         kit.rings(((z, r), (z1, r1)), colour, 10)
 
 
-def _drum(kit: Kit) -> None:
+def drum(kit: Kit) -> None:
     kit.rings(((0.0, 0.48), (0.32, 0.48)), kit.paint(), 14)
     kit.rings(((0.32, 0.5), (0.36, 0.5)), kit.paint(0.7), 14)
     kit.rings(((0.36, 0.48), (0.64, 0.48)), kit.paint(), 14)
@@ -218,29 +216,10 @@ def _drum(kit: Kit) -> None:
     kit.rings(((0.98, 0.44), (1.0, 0.44)), kit.paint(1.3), 14)
 
 
-def _barrier(kit: Kit) -> None:
-    stripes = kit.picture(world_prints.red_white)
+def barrier(kit: Kit) -> None:
+    stripes = kit.picture(prints.red_white)
     for low, high in ((0.40, 0.60), (0.74, 0.96)):
         kit.part((-0.08, 0.08), (-0.5, 0.5), (low, high), WHITE, stripes, back=stripes)
     for y in (-0.42, 0.36):
         kit.part((-0.06, 0.06), (y, y + 0.06), (0.04, 1.0), DARK)
         kit.part((-0.5, 0.5), (y, y + 0.06), (0.0, 0.05), DARK)
-
-
-BUILDERS: dict[str, Callable[[Kit], None]] = {
-    "hospital_bed": _hospital_bed,
-    "wheelchair": _wheelchair,
-    "medical_cart": _medical_cart,
-    "iv_stand": _iv_stand,
-    "medical_monitor": _medical_monitor,
-    "privacy_screen": _privacy_screen,
-    "storage_rack": _storage_rack,
-    "pallet": _pallet,
-    "empty_pallet": _empty_pallet,
-    "box_stack": _box_stack,
-    "forklift": _forklift,
-    "pallet_jack": _pallet_jack,
-    "traffic_cone": _traffic_cone,
-    "drum": _drum,
-    "barrier": _barrier,
-}

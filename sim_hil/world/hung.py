@@ -1,4 +1,4 @@
-"""Meshes and prints of objects on walls, ceilings and floors, one function per kind; they are no obstacles."""
+"""Meshes and prints of objects on walls, ceilings and floors, by the name of their kind; they are no obstacles."""
 
 from __future__ import annotations
 
@@ -8,16 +8,13 @@ from math import cos, pi, sin
 import cv2
 
 from sim_hil.scene.scene import SceneObject
-from sim_hil.world.drawing import prints as world_prints
-from sim_hil.world.drawing import textures
-from sim_hil.world.drawing.kit import STEEL, Drawing, Kit
-from sim_hil.world.drawing.textures import DARK, WHITE, Image, canvas, fill, plain, rgb, write
+from sim_hil.world.drawing import prints, textures
+from sim_hil.world.drawing.kit import STEEL, Drawing, Kit, plate
+from sim_hil.world.drawing.textures import DARK, WHITE, Image, canvas, fill, front, plain, rgb, write
 
 
 def _double_door_face(thing: SceneObject) -> Image:
-    """Two leaves with round windows, push plates and a sign above the handles."""
-    _, width, height = thing.size_m
-    image = canvas(width, height, rgb(thing.colour, 0.55))
+    image = front(thing, 0.55)
     for left in (0.03, 0.505):
         fill(image, left, 0.03, left + 0.465, 1, rgb(thing.colour))
         fill(image, left, 0.86, left + 0.465, 1, (176, 180, 184))
@@ -33,7 +30,6 @@ def _double_door_face(thing: SceneObject) -> Image:
 
 
 def _elevator_face(thing: SceneObject) -> Image:
-    """Steel doors in a frame, a lit floor display and ELEVATOR above, buttons beside."""
     _, width, height = thing.size_m
     image = canvas(width, height, (96, 100, 106))
     fill(image, 0.0, 0.0, 1.0, 0.16, (30, 34, 40))
@@ -53,9 +49,7 @@ def _elevator_face(thing: SceneObject) -> Image:
 
 
 def _loading_face(thing: SceneObject) -> Image:
-    """A roller door in a black and yellow frame, with its number."""
-    _, width, height = thing.size_m
-    image = canvas(width, height, rgb(thing.colour))
+    image = front(thing)
     rows = image.shape[0]
     for top in range(0, rows, 14):
         image[top : top + 4] = rgb(thing.colour, 0.82)
@@ -70,7 +64,6 @@ def _loading_face(thing: SceneObject) -> Image:
 
 
 def _whiteboard_face(thing: SceneObject) -> Image:
-    """Writing in three colours in an aluminium frame."""
     _, width, height = thing.size_m
     image = canvas(width, height, (168, 172, 176))
     fill(image, 0.02, 0.03, 0.98, 0.95, rgb(thing.colour))
@@ -85,9 +78,7 @@ def _whiteboard_face(thing: SceneObject) -> Image:
 
 
 def _painting_face(thing: SceneObject) -> Image:
-    """A landscape in a frame of the object's colour: sun, hills, a lake."""
-    _, width, height = thing.size_m
-    image = canvas(width, height, rgb(thing.colour))
+    image = front(thing)
     h, w = image.shape[:2]
     fill(image, 0.08, 0.10, 0.92, 0.90, (240, 190, 130))
     cv2.circle(image, (round(0.68 * w), round(0.36 * h)), round(0.12 * h), (250, 236, 170), -1)
@@ -102,7 +93,6 @@ def _painting_face(thing: SceneObject) -> Image:
 
 
 def _clock_face(thing: SceneObject) -> Image:
-    """Ten past ten."""
     image = plain(96, 96, rgb(thing.colour))
     cv2.rectangle(image, (0, 0), (95, 95), DARK, 5)
     for hour in range(12):
@@ -115,7 +105,6 @@ def _clock_face(thing: SceneObject) -> Image:
 
 
 def _room_face(thing: SceneObject) -> Image:
-    """A door plate: the number or name in white."""
     image = plain(128, 96, rgb(thing.colour))
     fill(image, 0.0, 0.86, 1.0, 1.0, (230, 180, 60))
     write(image, thing.text or "-", 0.06, 0.12, 0.94, 0.78, WHITE)
@@ -123,7 +112,6 @@ def _room_face(thing: SceneObject) -> Image:
 
 
 def _exit_face(thing: SceneObject) -> Image:
-    """EXIT and an arrow, white on green."""
     image = plain(256, 104, rgb(thing.colour))
     write(image, thing.text or "EXIT", 0.04, 0.10, 0.66, 0.90, WHITE)
     cv2.arrowedLine(image, (178, 52), (244, 52), WHITE, 10, tipLength=0.45)
@@ -131,7 +119,6 @@ def _exit_face(thing: SceneObject) -> Image:
 
 
 def _carpet_top(thing: SceneObject) -> Image:
-    """A border and a lozenge in a lighter colour."""
     depth, width, _ = thing.size_m
     image = canvas(width, depth, rgb(thing.colour))
     h, w = image.shape[:2]
@@ -144,52 +131,41 @@ def _carpet_top(thing: SceneObject) -> Image:
     return image
 
 
-def _slab(drawing: Drawing) -> Callable[[Kit], None]:
-    """Build a plate with a print on its front."""
-    return lambda kit: kit.whole(kit.paint(0.6), kit.picture(drawing))
+def _two_sided(drawing: Drawing) -> Callable[[Kit], None]:
+    """Build a sign that hangs from the ceiling, readable from both sides."""
+
+    def build(kit: Kit) -> None:
+        face = kit.picture(drawing)
+        kit.whole(kit.paint(0.6), face, back=face)
+
+    return build
 
 
-def _sign(kit: Kit) -> None:
-    plate = kit.picture(textures.sign)
-    # Signs on the ceiling are readable from both sides.
-    kit.whole(kit.paint(0.6), plate, back=plate)
-
-
-def _exit_sign(kit: Kit) -> None:
-    plate = kit.picture(_exit_face)
-    kit.whole(kit.paint(0.6), plate, back=plate)
-
-
-def _carpet(kit: Kit) -> None:
+def carpet(kit: Kit) -> None:
     kit.whole(kit.paint(), top=kit.picture(_carpet_top))
 
 
-def _handrail(kit: Kit) -> None:
+def handrail(kit: Kit) -> None:
     kit.part((-0.2, 0.5), (-0.5, 0.5), (0.92, 1.0), kit.paint())
     for k in range(max(round(kit.width / 1.2), 2)):
         y = -0.46 + 0.92 * k / (max(round(kit.width / 1.2), 2) - 1)
         kit.part((-0.5, 0.2), (y - 0.01, y + 0.01), (0.86, 0.92), STEEL)
 
 
-def _light(kit: Kit) -> None:
+def light(kit: Kit) -> None:
     kit.whole(kit.paint())
 
 
-BUILDERS: dict[str, Callable[[Kit], None]] = {
-    "door": _slab(textures.door),
-    "double_door": _slab(_double_door_face),
-    "elevator": _slab(_elevator_face),
-    "loading_door": _slab(_loading_face),
-    "window": _slab(textures.window),
-    "notice_board": _slab(textures.notice_board),
-    "whiteboard": _slab(_whiteboard_face),
-    "screen": _slab(world_prints.chart),
-    "painting": _slab(_painting_face),
-    "clock": _slab(_clock_face),
-    "sign": _sign,
-    "room_sign": _slab(_room_face),
-    "exit_sign": _exit_sign,
-    "light": _light,
-    "carpet": _carpet,
-    "handrail": _handrail,
-}
+door = plate(textures.door)
+double_door = plate(_double_door_face)
+elevator = plate(_elevator_face)
+loading_door = plate(_loading_face)
+window = plate(textures.window)
+notice_board = plate(textures.notice_board)
+whiteboard = plate(_whiteboard_face)
+screen = plate(prints.chart)
+painting = plate(_painting_face)
+clock = plate(_clock_face)
+room_sign = plate(_room_face)
+sign = _two_sided(textures.sign)
+exit_sign = _two_sided(_exit_face)

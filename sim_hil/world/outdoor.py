@@ -1,11 +1,10 @@
-"""Meshes of outdoor objects in streets and squares, one function per kind."""
+"""Meshes of outdoor objects in streets and squares: every function builds the kind of object of its name."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from math import cos, pi, sin
 
-from sim_hil.world.drawing import prints as world_prints
+from sim_hil.world.drawing import prints
 from sim_hil.world.drawing.kit import BLACK, DARK, STEEL, WHITE, WOOD, Kit
 from sim_hil.world.drawing.mesh import Vec3
 from sim_hil.world.drawing.textures import Colour
@@ -15,7 +14,7 @@ _WATER: Colour = (70, 150, 205)
 _BARK: Colour = (104, 74, 48)
 
 
-def _fountain(kit: Kit) -> None:
+def fountain(kit: Kit) -> None:
     """A basin of stone, a bowl on a pedestal, and the water's jet."""
     rim = 0.42 / kit.height
     kit.rings(((0.0, 0.5), (rim, 0.5)), kit.paint(), 16)
@@ -43,14 +42,14 @@ def _canopy(kit: Kit) -> None:
         kit.both(colour, shade, (ax, ay, hem), (bx, by, hem), (bx, by, edge), (ax, ay, edge))
 
 
-def _umbrella(kit: Kit) -> None:
+def umbrella(kit: Kit) -> None:
     kit.part((-0.1, 0.1), (-0.1, 0.1), (0.0, 0.04), (96, 98, 100))
     kit.post(0, 0, (0.04, 0.98), 0.03, WHITE)
     _canopy(kit)
 
 
-def _umbrella_table(kit: Kit) -> None:
-    _umbrella(kit)
+def umbrella_table(kit: Kit) -> None:
+    umbrella(kit)
     kit.rings(((0.275, 0.18), (0.30, 0.18)), (236, 232, 222), 14)
     for k in range(3):
         turn = 2 * pi * k / 3
@@ -70,27 +69,27 @@ def _awning_on(kit: Kit, x: tuple[float, float], y: tuple[float, float], z: tupl
         kit.both(colour, shade, (x[1], a, z[0] - drop), (x[1], b, z[0] - drop), (x[1], b, z[0]), (x[1], a, z[0]))
 
 
-def _storefront(kit: Kit) -> None:
-    kit.whole(kit.paint(0.6), kit.picture(world_prints.storefront_face))
+def storefront(kit: Kit) -> None:
+    kit.whole(kit.paint(0.6), kit.picture(prints.storefront_face))
     reach = 0.5 + 1.0 / kit.depth
     _awning_on(kit, (0.5, reach), (-0.47, 0.47), (0.56, 0.69))
 
 
-def _building(kit: Kit) -> None:
-    front, side = kit.picture(world_prints.facade_front), kit.picture(world_prints.facade_side)
-    kit.whole(kit.paint(0.7), front, side, kit.picture(world_prints.facade))
+def building(kit: Kit) -> None:
+    front, side = kit.picture(prints.facade_front), kit.picture(prints.facade_side)
+    kit.whole(kit.paint(0.7), front, side, kit.picture(prints.facade))
     ledge = 0.3 / kit.height
     kit.part((-0.51, 0.51), (-0.505, 0.505), (1.0 - ledge, 1.0), kit.paint(0.55))
 
 
-def _kiosk(kit: Kit) -> None:
-    kit.part((-0.5, 0.42), (-0.5, 0.5), (0.0, 0.94), kit.paint(0.8), kit.picture(world_prints.kiosk_face))
+def kiosk(kit: Kit) -> None:
+    kit.part((-0.5, 0.42), (-0.5, 0.5), (0.0, 0.94), kit.paint(0.8), kit.picture(prints.kiosk_face))
     kit.part((0.42, 0.56), (-0.46, 0.46), (0.34, 0.38), (226, 214, 190))
     kit.part((-0.56, 0.5), (-0.54, 0.54), (0.94, 1.0), kit.paint(0.5))
     _awning_on(kit, (0.42, 0.66), (-0.5, 0.5), (0.66, 0.72))
 
 
-def _park_bench(kit: Kit) -> None:
+def park_bench(kit: Kit) -> None:
     for row in range(3):
         low = -0.28 + 0.25 * row
         kit.part((low, low + 0.2), (-0.5, 0.5), (0.46, 0.51), kit.paint())
@@ -103,7 +102,7 @@ def _park_bench(kit: Kit) -> None:
         kit.part((0.36, 0.44), (y, y + 0.04), (0.0, 0.66), BLACK)
 
 
-def _lamp_post(kit: Kit) -> None:
+def lamp_post(kit: Kit) -> None:
     kit.post(0, 0, (0.0, 0.14), 0.11, kit.paint(), 8)
     kit.post(0, 0, (0.14, 0.84), 0.055, kit.paint(), 6)
     kit.rings(((0.84, 0.10), (0.86, 0.22)), kit.paint(), 8)
@@ -111,7 +110,7 @@ def _lamp_post(kit: Kit) -> None:
     kit.rings(((0.95, 0.34), (1.0, 0.06)), kit.paint(), 8)
 
 
-def _tree(kit: Kit) -> None:
+def tree(kit: Kit) -> None:
     kit.post(0, 0, (0.0, 0.55), 0.05 * kit.depth, _BARK, 7)
     rng = kit.rng()
     kit.ball(0, 0, 0.74, (0.42 * kit.depth, 0.42 * kit.width, 0.25 * kit.height), kit.paint(), 8)
@@ -123,12 +122,12 @@ def _tree(kit: Kit) -> None:
         kit.ball(0.26 * cos(turn), 0.26 * sin(turn), z, radii, kit.paint(0.8 + 0.5 * rng.random()), 6, 5)
 
 
-def _hedge(kit: Kit) -> None:
-    green = kit.picture(world_prints.leaves)
+def hedge(kit: Kit) -> None:
+    green = kit.picture(prints.leaves)
     kit.whole(kit.paint(), green, green, green, green)
 
 
-def _planter(kit: Kit) -> None:
+def planter(kit: Kit) -> None:
     kit.part((-0.5, 0.5), (-0.5, 0.5), (0.0, 0.55), kit.paint())
     kit.part((-0.44, 0.44), (-0.46, 0.46), (0.55, 0.60), (92, 66, 44))
     rng = kit.rng()
@@ -142,13 +141,13 @@ def _planter(kit: Kit) -> None:
             kit.ball(x, y, 0.84 + 0.1 * rng.random(), (0.07, 0.07, 0.06), blooms[int(rng.integers(4))], 4, 3)
 
 
-def _bollard(kit: Kit) -> None:
+def bollard(kit: Kit) -> None:
     for z, z1, colour in ((0.0, 0.70, kit.paint()), (0.70, 0.84, (236, 228, 90)), (0.84, 0.94, kit.paint())):
         kit.rings(((z, 0.42), (z1, 0.42)), colour, 10)
     kit.rings(((0.94, 0.42), (1.0, 0.2)), kit.paint(1.2), 10)
 
 
-def _car(kit: Kit) -> None:
+def car(kit: Kit) -> None:
     """Body with bonnet and boot, a cabin of glass, lamps, plates, wheels; the front is the bonnet."""
     body, glass = kit.paint(), (52, 66, 78)
     kit.part((-0.49, 0.49), (-0.46, 0.46), (0.16, 0.42), body)
@@ -176,14 +175,14 @@ def _car(kit: Kit) -> None:
             kit.wheel(x, y * 1.02, 0.18, 0.17, (190, 194, 198), 0.13)
 
 
-def _mailbox(kit: Kit) -> None:
+def mailbox(kit: Kit) -> None:
     kit.legs((0.0, 0.25), 0.06, (0.1, 0.1), DARK)
-    kit.part((-0.5, 0.5), (-0.5, 0.5), (0.25, 0.88), kit.paint(0.9), kit.picture(world_prints.mail_front))
+    kit.part((-0.5, 0.5), (-0.5, 0.5), (0.25, 0.88), kit.paint(0.9), kit.picture(prints.mail_front))
     kit.part((-0.36, 0.36), (-0.5, 0.5), (0.88, 1.0), kit.paint())
 
 
-def _bus_stop(kit: Kit) -> None:
-    pane = kit.picture(world_prints.timetable)
+def bus_stop(kit: Kit) -> None:
+    pane = kit.picture(prints.timetable)
     kit.part((-0.5, -0.46), (-0.46, 0.46), (0.08, 0.88), STEEL, pane, back=pane)
     kit.part((-0.46, 0.40), (0.475, 0.495), (0.08, 0.88), (186, 214, 222))
     for y in (-0.47, 0.47):
@@ -193,14 +192,14 @@ def _bus_stop(kit: Kit) -> None:
     kit.part((-0.42, 0.0), (-0.35, 0.35), (0.17, 0.20), WOOD)
     for y in (-0.3, 0.28):
         kit.part((-0.26, -0.2), (y, y + 0.02), (0.0, 0.17), DARK)
-    sign = kit.picture(world_prints.bus_plate)
+    sign = kit.picture(prints.bus_plate)
     kit.part((0.38, 0.46), (-0.5, -0.36), (0.72, 0.94), kit.paint(), sign, sign, sign)
 
 
-def _statue(kit: Kit) -> None:
+def statue(kit: Kit) -> None:
     """A figure with a raised arm on a pedestal of stone."""
     kit.part((-0.5, 0.5), (-0.5, 0.5), (0.0, 0.08), _STONE)
-    kit.part((-0.36, 0.36), (-0.36, 0.36), (0.08, 0.40), (206, 202, 192), kit.picture(world_prints.plate))
+    kit.part((-0.36, 0.36), (-0.36, 0.36), (0.08, 0.40), (206, 202, 192), kit.picture(prints.plate))
     kit.part((-0.42, 0.42), (-0.42, 0.42), (0.40, 0.43), _STONE)
     bronze = kit.paint()
     for y in (-0.09, 0.09):
@@ -216,13 +215,13 @@ def _statue(kit: Kit) -> None:
         kit.mesh.prism(kit.frame, ((kit.at(*low), 0.055, 0.055), (kit.at(*high), 0.05, 0.05)), bronze, 6)
 
 
-def _sign_post(kit: Kit) -> None:
+def sign_post(kit: Kit) -> None:
     kit.post(0, 0, (0.0, 0.98), 0.035, STEEL)
-    board = kit.picture(world_prints.plate)
+    board = kit.picture(prints.plate)
     kit.part((-0.1, 0.12), (-0.5, 0.5), (0.74, 0.98), STEEL, board, back=board)
 
 
-def _bicycle_rack(kit: Kit) -> None:
+def bicycle_rack(kit: Kit) -> None:
     for k in range(4):
         y = -0.42 + 0.28 * k
         for x in (-0.18, 0.18):
@@ -245,24 +244,5 @@ def _bicycle_rack(kit: Kit) -> None:
         kit.part((0.24, 0.28), (y - 0.13, y + 0.13), (0.90, 0.94), BLACK)
 
 
-BUILDERS: dict[str, Callable[[Kit], None]] = {
-    "fountain": _fountain,
-    "umbrella": _umbrella,
-    "umbrella_table": _umbrella_table,
-    "storefront": _storefront,
-    "building": _building,
-    "kiosk": _kiosk,
-    "park_bench": _park_bench,
-    "lamp_post": _lamp_post,
-    "tree": _tree,
-    "hedge": _hedge,
-    "planter": _planter,
-    "bollard": _bollard,
-    "car": _car,
-    "mailbox": _mailbox,
-    "bus_stop": _bus_stop,
-    "statue": _statue,
-    "sign_post": _sign_post,
-    "bicycle_rack": _bicycle_rack,
-    "awning": lambda kit: _awning_on(kit, (-0.5, 0.5), (-0.5, 0.5), (0.2, 1.0)),
-}
+def awning(kit: Kit) -> None:
+    _awning_on(kit, (-0.5, 0.5), (-0.5, 0.5), (0.2, 1.0))

@@ -70,7 +70,7 @@ class Visibility:
         boxes = np.array(bounds).reshape(-1, 4)
         self._low, self._high = boxes[:, :2], boxes[:, 2:]
 
-    def look(self, eye_xy: Array, ahead_xy: Array, half_width: float) -> Sight:
+    def sight(self, eye_xy: Array, ahead_xy: Array, half_width: float) -> Sight:
         """Cast the rays from the camera around a unit vector, up to `half_width` (a tangent) on each side."""
         half = half_width * _MARGIN
         rays = ahead_xy + np.linspace(-half, half, RAYS)[:, None] * np.array((-ahead_xy[1], ahead_xy[0]))

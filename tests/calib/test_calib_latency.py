@@ -11,7 +11,7 @@ import pytest
 
 from calib.cli import main
 from calib.latency import LEAST
-from calib.latency_load import WARM, Generations, MeasureError, measure
+from calib.latency_load import WARM, Measured, MeasureError, measure
 from edge.artifacts.manifest import load_artifacts
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE
 from edge.flightlog.recorder import Recorder
@@ -48,8 +48,8 @@ def test_a_log_becomes_a_profile_that_the_benchmark_reads(flight_log: Path, tmp_
     profile = parse_latency(f"profile:{out}")
     assert profile.generation_s == pytest.approx([1.5] * 30) and profile.anchor_after_s == pytest.approx([0.5] * 30)
     assert profile.tagged == "measured"
-    told = json.loads(capsys.readouterr().out)
-    assert told["generations"] == 30 and told["mean_s"] == pytest.approx(1.5) and told["tagged"] == "measured"
+    result = json.loads(capsys.readouterr().out)
+    assert result["generations"] == 30 and result["mean_s"] == pytest.approx(1.5) and result["tagged"] == "measured"
 
 
 def test_a_scaled_profile_has_that_mean_and_says_that_it_is_modelled(flight_log: Path, tmp_path: Path) -> None:
@@ -61,19 +61,13 @@ def test_a_scaled_profile_has_that_mean_and_says_that_it_is_modelled(flight_log:
     assert profile.anchor_after_s == pytest.approx([1.0] * 30)
 
 
-def test_scaling_keeps_the_shape() -> None:
-    profile = LatencyProfile("n", "s", (1.0, 2.0, 6.0), (0.0, 1.0, 6.0), "measured").scaled_to_mean(1.5)
-    assert profile.generation_s == pytest.approx((0.5, 1.0, 3.0))
-    assert profile.anchor_after_s == pytest.approx((0.0, 0.5, 3.0))
-
-
 @pytest.mark.parametrize("mean_s", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_mean_that_no_profile_has_is_refused(mean_s: float) -> None:
     with pytest.raises(LatencyError, match="means above 0 s"):
         LatencyProfile("n", "s", (1.0,)).scaled_to_mean(mean_s)
 
 
-def test_a_profile_says_whether_it_was_measured_or_that_nobody_knows() -> None:
+def test_a_profile_says_whether_it_was_measured_or_is_modelled() -> None:
     content = {"schema": 1, "name": "n", "source": "s", "generation_s": [1.0]}
     assert LatencyProfile.of_json(content).tagged == "modelled"
     assert LatencyProfile.of_json({**content, "tagged": "measured"}).tagged == "measured"
@@ -94,7 +88,7 @@ def test_too_few_generations_make_no_profile(tmp_path: Path, capsys: Any) -> Non
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         (("--log", "nowhere.mcap", "--out", "p.json"), "nowhere.mcap"),
         (("--artifacts", "nowhere", "--out", "p.json"), "nowhere"),
@@ -106,70 +100,46 @@ def test_too_few_generations_make_no_profile(tmp_path: Path, capsys: Any) -> Non
     ],
 )
 def test_what_makes_no_sense_is_one_line(
-    arguments: tuple[str, ...], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+    arguments: tuple[str, ...], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert run(*arguments) == EXIT_BAD_INPUT
-    told = capsys.readouterr().err
-    assert says in told and told.count("\n") == 1 and not list(tmp_path.iterdir())
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1 and not list(tmp_path.iterdir())
 
 
-def test_generations_are_taken_as_a_flight_log_would_have_them() -> None:
-    found = Generations()
-    found.put("/tick", 1, {})
-    found.put("/semantic", 2, semantic(1.0, 1.5, 4.0))
-    assert found.times_s == [pytest.approx((3.0, 0.5))]
-
-
-@pytest.mark.slow
-def test_a_model_thinks_beside_ticks_and_the_first_generations_are_left_out(artifacts_dir: Path) -> None:
-    said: list[str] = []
-    measured = measure(
+def measured(artifacts_dir: Path, *, mode: Mode = Mode.ASYNC, generations: int = 2, seconds: float = 60.0) -> Measured:
+    return measure(
         load_artifacts(artifacts_dir),
         load_calibration("corridor-go2").clips[0],
         instruction=INSTRUCTION,
-        mode=Mode.ASYNC,
-        generations=2,
-        seconds=60.0,
-        say=said.append,
+        mode=mode,
+        generations=generations,
+        seconds=seconds,
+        say=lambda _line: None,
         stop=threading.Event(),
     )
-    assert len(measured.times_s) >= 2 and measured.failed == 0
-    assert all(0 <= anchor_s < total_s < 60 for total_s, anchor_s in measured.times_s)
+
+
+@pytest.mark.slow
+def test_generations_run_beside_ticks_and_the_first_generations_are_left_out(artifacts_dir: Path) -> None:
+    found = measured(artifacts_dir)
+    assert len(found.times_s) >= 2 and found.failed == 0
+    assert all(0 <= anchor_s < total_s < 60 for total_s, anchor_s in found.times_s)
     # Ticks went on all the while: ten a second, were it not for a busy machine.
-    assert measured.ticks >= len(measured.times_s) + WARM
+    assert found.ticks >= len(found.times_s) + WARM
 
 
 @pytest.mark.slow
 def test_a_measurement_ends_after_its_time_with_what_there_is(artifacts_dir: Path) -> None:
-    measured = measure(
-        load_artifacts(artifacts_dir),
-        load_calibration("corridor-go2").clips[0],
-        instruction=INSTRUCTION,
-        mode=Mode.NO_REASONING,
-        generations=10_000,
-        seconds=0.5,
-        say=lambda _line: None,
-        stop=threading.Event(),
-    )
-    assert len(measured.times_s) < 10_000
+    found = measured(artifacts_dir, mode=Mode.NO_REASONING, generations=10_000, seconds=0.5)
+    assert len(found.times_s) < 10_000
 
 
 def test_a_control_thread_that_dies_ends_the_measurement(artifacts_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from calib import latency_load
-
-    def fail(_self: object) -> None:
+    def fail(*_: object) -> None:
         raise ValueError("no picture")
 
-    monkeypatch.setattr(latency_load.Ticks, "_tick", fail)
+    monkeypatch.setattr("calib.latency_load.TokenRing.put", fail)
     with pytest.raises(MeasureError, match="no picture"):
-        measure(
-            load_artifacts(artifacts_dir),
-            load_calibration("corridor-go2").clips[0],
-            instruction=INSTRUCTION,
-            mode=Mode.ASYNC,
-            generations=2,
-            seconds=60.0,
-            say=lambda _line: None,
-            stop=threading.Event(),
-        )
+        measured(artifacts_dir)

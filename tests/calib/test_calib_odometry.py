@@ -12,6 +12,7 @@ import pytest
 
 from calib import odometry as calib
 from calib.cli import main
+from calib.odometry import calibration_text
 from edge.flightlog.recorder import Recorder
 from edge.odometry.calibration import CalibrationError, OdometryCalibration, load_calibration
 from tests.support.runner.floor_pictures import GEOMETRY, floor_texture, picture
@@ -154,7 +155,7 @@ def test_a_trace_of_another_time_is_named(tmp_path: Path, capsys) -> None:  # ty
 def test_a_calibration_reads_back_as_written(tmp_path: Path) -> None:
     path = tmp_path / "c.toml"
     written = OdometryCalibration(scale_x=1.031, gyro_bias_radps=-0.004)
-    path.write_text(written.to_toml("one line\nand another"))
+    path.write_text(calibration_text(written, "a test"))
     found = load_calibration(path)
     assert (found.scale_x, found.gyro_bias_radps) == (1.031, -0.004)
     assert asdict(found) == pytest.approx(asdict(written), rel=1e-5)
@@ -173,7 +174,7 @@ def test_a_calibration_reads_back_as_written(tmp_path: Path) -> None:
 )
 def test_a_calibration_that_cannot_be_used_is_refused(change, says: str, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     path = tmp_path / "c.toml"
-    path.write_text(change(OdometryCalibration().to_toml("")))
+    path.write_text(change(calibration_text(OdometryCalibration(), "a test")))
     with pytest.raises(CalibrationError, match=says):
         load_calibration(path)
 

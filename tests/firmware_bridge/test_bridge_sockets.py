@@ -53,19 +53,19 @@ class TestOneClient:
 
     @pytest.mark.parametrize("error", [errno.EMFILE, errno.ECONNABORTED])
     def test_a_connection_that_cannot_be_accepted_ends_nothing_and_is_not_polled_in_a_loop(
-        self, path: Path, error: int
+        self, path: Path, error: int, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        class Failing:
-            def accept(self) -> None:
-                raise OSError(error, os.strerror(error))
+        def fail(_: socket.socket) -> None:
+            raise OSError(error, os.strerror(error))
 
         with closing(ClientLink(path)) as link:
-            listener, link._listener = link._listener, Failing()  # type: ignore[assignment]
-            assert link.receive() == []
-            assert link.files() == []
-            link._listener = listener
+            listening = link.files()
+            with monkeypatch.context() as patch:
+                patch.setattr(socket.socket, "accept", fail)
+                assert link.receive() == []
+                assert link.files() == []
             link.receive()
-            assert link.files() == [listener]
+            assert link.files() == listening
 
 
 class TestOperators:
@@ -141,11 +141,11 @@ class TestFolder:
 
 
 class Answering:
-    """A bridge's operator socket: notes what it is told, and answers as a bridge that obeys; in its own thread."""
+    """A bridge's operator socket in a thread: notes what it receives, and answers as a bridge that obeys."""
 
     def __init__(self, path: Path, drop: int = 0) -> None:
-        """`drop`: so many clients are sent away when they have said stop."""
-        self.heard: list[Message] = []
+        """`drop`: so many clients are disconnected when they have sent a stop."""
+        self.received: list[Message] = []
         self._drop = drop
         self._link = ClientLink(Path(f"{path}{OPERATOR_SUFFIX}"), places=4)
         self._closing = threading.Event()
@@ -158,14 +158,14 @@ class Answering:
             messages = self._link.receive()
             if Stop() in messages and self._drop > 0:
                 self._drop -= 1
-                self._link._drop(self._link._clients[0])
+                self._link.files()[-1].shutdown(socket.SHUT_RDWR)
                 continue
-            self.heard += messages
-            stopped = "estop" if Stop() in self.heard else "none"
+            self.received += messages
+            stopped = "estop" if Stop() in self.received else "none"
             stamp_ns += 10**9
             zero = (0.0, 0.0, 0.0)
-            self._link.tell(
-                BridgeStatus(stamp_ns, "stopped", "as said", 0, 0, 0, zero, True, stopped, stopped, motion="still")
+            self._link.send_status(
+                BridgeStatus(stamp_ns, "stopped", "as commanded", 0, 0, 0, zero, True, stopped, stopped, motion="still")
             )
 
     def close(self) -> None:
@@ -189,12 +189,12 @@ class TestOperate:
         paths = tmp_path / "service", tmp_path / "own"
         with answering(*paths) as bridges:
             assert operate("stop", *paths)[0] == 0
-        assert all(Stop() in bridge.heard for bridge in bridges)
+        assert all(Stop() in bridge.received for bridge in bridges)
 
-    def test_a_stop_whose_connection_ends_is_said_again(self, path: Path) -> None:
+    def test_a_stop_whose_connection_ends_is_sent_again(self, path: Path) -> None:
         with answering(path, drop=2) as (bridge,):
             assert operate("stop", path)[0] == 0
-        assert Stop() in bridge.heard
+        assert Stop() in bridge.received
 
     def test_a_socket_where_nobody_listens_changes_nothing(self, path: Path, tmp_path: Path) -> None:
         with answering(path):
@@ -204,8 +204,8 @@ class TestOperate:
         paths = tmp_path / "service", tmp_path / "own"
         with answering(*paths) as bridges:
             assert operate("arm", *paths)[0] == 3
-        assert not any(Arm() in bridge.heard for bridge in bridges)
-        assert "say which with --socket" in capsys.readouterr().err
+        assert not any(Arm() in bridge.received for bridge in bridges)
+        assert "choose one with --socket" in capsys.readouterr().err
 
     @pytest.mark.parametrize(("own", "code"), [(True, 1), (False, 3)])
     def test_a_bridge_that_this_user_may_not_reach_is_no_success(

@@ -9,7 +9,7 @@ from firmware_bridge.line_log import LineLog
 
 
 class StalledStream(io.StringIO):
-    """A stream that takes nothing until it is told to."""
+    """A stream that takes nothing until `flowing` is set."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -24,7 +24,7 @@ def test_lines_come_out_in_order_with_their_prefix() -> None:
     stream = io.StringIO()
     log = LineLog(stream, "edge-bridge")
     for line in ("armed", "stopped"):
-        log.say(line)
+        log.write(line)
     log.close(5.0)
     assert stream.getvalue() == "edge-bridge: armed\nedge-bridge: stopped\n"
 
@@ -33,7 +33,7 @@ def test_a_stalled_stream_holds_nobody_up_and_what_does_not_fit_is_counted() -> 
     stream = StalledStream()
     log = LineLog(stream, "edge-bridge", capacity=4)
     for number in range(100):
-        log.say(str(number))
+        log.write(str(number))
     assert log.dropped >= 95
     log.close(0.05)
     assert stream.getvalue() == ""
@@ -44,5 +44,5 @@ def test_a_closed_stream_is_survived() -> None:
     stream = io.StringIO()
     stream.close()
     log = LineLog(stream, "edge-bridge")
-    log.say("anybody there?")
+    log.write("anybody there?")
     log.close(5.0)

@@ -1,4 +1,4 @@
-"""What a service says to systemd, and that saying it can neither block nor fail."""
+"""The messages of a service to systemd, and that sending them can neither block nor fail."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def manager(tmp_path: Path) -> Iterator[NotifySocket]:
         yield listening
 
 
-def test_every_message_is_one_datagram_in_systemds_words(manager: NotifySocket) -> None:
+def test_every_message_is_one_datagram_as_systemd_reads_it(manager: NotifySocket) -> None:
     notifier = Notifier(manager.environment())
     assert notifier.extend(30)
     assert notifier.ready("armed")
@@ -42,7 +42,7 @@ def test_a_socket_in_the_abstract_namespace_is_reached(tmp_path: Path) -> None:
         assert manager.messages() == [{"WATCHDOG": "1"}]
 
 
-def test_outside_a_service_nothing_is_said() -> None:
+def test_outside_a_service_nothing_is_sent() -> None:
     notifier = Notifier({})
     assert not notifier.enabled
     assert notifier.watchdog_period_ns is None
@@ -64,7 +64,7 @@ def test_a_manager_that_does_not_read_costs_messages_and_no_time(manager: Notify
     assert notifier.watchdog()
 
 
-def test_a_manager_that_comes_back_is_heard_again(tmp_path: Path) -> None:
+def test_a_manager_that_comes_back_gets_messages_again_until_the_end(tmp_path: Path) -> None:
     path = tmp_path / "notify"
     with notify_socket(path) as manager:
         notifier = Notifier(manager.environment())
@@ -73,23 +73,19 @@ def test_a_manager_that_comes_back_is_heard_again(tmp_path: Path) -> None:
     with notify_socket(path) as manager:
         assert notifier.watchdog()
         assert manager.messages() == [{"WATCHDOG": "1"}]
+        for _ in range(2):
+            notifier.close()
+        assert not notifier.status("late")
+        assert manager.messages() == []
 
 
-def test_after_close_nothing_is_said(manager: NotifySocket) -> None:
-    notifier = Notifier(manager.environment())
-    notifier.close()
-    notifier.close()
-    assert not notifier.status("late")
-    assert manager.messages() == []
-
-
-def test_the_watchdog_is_due_at_half_its_time(manager: NotifySocket) -> None:
-    notifier = Notifier(manager.environment(watchdog_us=1_000_000, pid=os.getpid()))
-    assert notifier.watchdog_period_ns == 500_000_000
-
-
-def test_a_watchdog_meant_for_another_process_is_left_alone(manager: NotifySocket) -> None:
-    assert Notifier(manager.environment(watchdog_us=1_000_000, pid=os.getpid() + 1)).watchdog_period_ns is None
+@pytest.mark.parametrize(
+    ("pid", "period_ns"), [(os.getpid(), 500_000_000), (os.getpid() + 1, None)], ids=["own", "other"]
+)
+def test_the_watchdog_is_due_at_half_its_time_if_it_is_meant_for_this_process(
+    manager: NotifySocket, pid: int, period_ns: int | None
+) -> None:
+    assert Notifier(manager.environment(watchdog_us=1_000_000, pid=pid)).watchdog_period_ns == period_ns
 
 
 @pytest.mark.parametrize("text", ["", "0", "-5", "1e6", "½", "9" * 40])

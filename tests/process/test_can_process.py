@@ -1,5 +1,4 @@
-"""`edge-hil --robot carter --protocol can` as a user starts it, driven by `sim_hil.protocols.can.drive` from another
-process."""
+"""`edge-hil --robot carter --protocol can`, driven by `sim_hil.protocols.can.drive` in another process."""
 
 from __future__ import annotations
 
@@ -25,18 +24,8 @@ def _drive(*arguments: str) -> subprocess.CompletedProcess[str]:
 def test_a_session_over_a_serial_line_arms_drives_and_stops(tmp_path: Path) -> None:
     line, result = tmp_path / "can", tmp_path / "hil.json"
     link = f"serial:{line},camera=0"
-    command = [
-        sys.executable,
-        "-m",
-        "sim_hil.hil.command",
-        "--robot",
-        "carter",
-        "--protocol",
-        "can",
-        "--scene",
-        "corridor",
-    ]
-    command += ["--link", link, "--camera", "64x36", "--json", str(result)]
+    options = ["--robot", "carter", "--protocol", "can", "--scene", "corridor", "--camera", "64x36"]
+    command = [sys.executable, "-m", "sim_hil.hil.command", *options, "--link", link, "--json", str(result)]
     hil = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     try:
         assert hil.stderr is not None
@@ -55,7 +44,7 @@ def test_a_session_over_a_serial_line_arms_drives_and_stops(tmp_path: Path) -> N
         hil.wait(30)
     assert hil.returncode == 0
     wire = json.loads(result.read_text(encoding="utf-8"))
-    # On a busy machine the run may begin late or stutter, never drive further than it was told.
+    # On a busy machine the run may begin late or stutter, but never drives further than commanded.
     assert 0.2 < driven["moved_m"] < 0.9 and abs(driven["end_speed_mps"]) < 0.02
     assert driven["base_counted"]["CrcErrors"] == 0
     assert wire["path_m"] == pytest.approx(driven["moved_m"], abs=0.1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import signal
@@ -15,10 +14,9 @@ from pathlib import Path
 import psutil
 import pytest
 
-from reporting.progress_line import Progress, TraceTail
 from sim_hil.processes.child_process import last_lines
 from sim_hil.realtime.children import Children, StepError
-from sim_hil.realtime.stack import COMMANDS, free_domain, socket_dir
+from sim_hil.realtime.stack import free_domain, socket_dir
 from tools import demo
 from tools.report.machine import machine_facts
 
@@ -67,20 +65,6 @@ def test_all_steps_give_a_report_whose_path_is_the_last_line(
     assert (tmp_path / "demo" / "report.html").exists()
     assert json.loads((tmp_path / "demo" / "demo.json").read_text())["wall_s"] > 0
     assert left_behind(tmp_path) == [] and socket_folders(temporary) == []
-
-
-@pytest.mark.slow
-def test_a_failed_check_is_exit_1_and_still_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    def report(files: object, *, wall_s: float) -> dict[str, object]:
-        return {"checks": {"tick_p99_ms": {"value": 120.0, "limit": 100.0, "pass": False}}}
-
-    out = tmp_path / "demo"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(demo.run_demo, "__defaults__", (COMMANDS, report))
-        assert run(out) == 1
-    captured = capsys.readouterr()
-    assert "check tick_p99_ms failed" in captured.err
-    assert captured.out == f"{out / 'report.html'}\n"
 
 
 def test_good_artifacts_are_not_exported_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -145,21 +129,25 @@ def test_a_run_that_a_fault_ended_is_named_and_still_gets_its_report(
 
 
 @pytest.mark.slow
-def test_a_robot_that_ends_while_the_runner_drives_fails_the_demo(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("moods", "message"),
+    [
+        ({"hil": "early", "run": "slow"}, "step 'edge-hil' failed: ended too early with exit code 7"),
+        ({"hil": "slow"}, "step 'edge-hil' failed: no ready line within 1 s"),
+    ],
+    ids=["ends early", "never ready"],
+)
+def test_a_robot_that_ends_early_or_is_never_ready_fails_the_demo(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    moods: dict[str, str],
+    message: str,
 ) -> None:
-    assert run(tmp_path, hil="early", run="slow") == 1
-    assert "step 'edge-hil' failed: ended too early with exit code 7" in capsys.readouterr().err
-    assert left_behind(tmp_path) == []
-
-
-@pytest.mark.slow
-def test_a_robot_that_never_gets_ready_fails_the_demo(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(demo, "READY_TIMEOUT_S", 1.0)
-    assert run(tmp_path, hil="slow") == 1
-    assert "step 'edge-hil' failed: no ready line within 1 s" in capsys.readouterr().err
+    if "run" not in moods:
+        monkeypatch.setattr(demo, "READY_TIMEOUT_S", 1.0)
+    assert run(tmp_path, **moods) == 1
+    assert message in capsys.readouterr().err
     assert left_behind(tmp_path) == []
 
 
@@ -302,34 +290,21 @@ def test_settings_note_the_machine_and_where_the_artifacts_are(tmp_path: Path) -
     assert json.loads((out / "settings.json").read_text())["artifacts"] == str(elsewhere)
 
 
-def test_a_domain_in_use_is_not_chosen(tmp_path: Path) -> None:
-    head = "  sl  local_address rem_address   st\n"
-    taken = [domain for domain in range(1, 91) if domain != 42]
+@pytest.mark.parametrize("free", [42, None])
+def test_only_a_free_domain_is_chosen(tmp_path: Path, free: int | None) -> None:
+    taken = [domain for domain in range(1, 91) if domain != free]
     lines = [f"   1: 0100007F:{7400 + 250 * domain + 11:04X} 00000000:0000 07\n" for domain in taken]
-    (tmp_path / "udp").write_text(head + "".join(lines))
-    assert free_domain([tmp_path / "udp", tmp_path / "absent"]) == 42
-
-
-def test_no_free_domain_is_an_error(tmp_path: Path) -> None:
-    lines = [f"   1: 0100007F:{7400 + 250 * domain:04X} 00000000:0000 07\n" for domain in range(1, 91)]
-    (tmp_path / "udp").write_text("head\n" + "".join(lines))
+    (tmp_path / "udp").write_text("  sl  local_address rem_address   st\n" + "".join(lines))
+    if free is not None:
+        assert free_domain([tmp_path / "udp", tmp_path / "absent"]) == free
+        return
     with pytest.raises(ValueError, match="no free DDS domain"):
         free_domain([tmp_path / "udp"])
 
 
-def test_off_a_terminal_the_progress_is_plain_lines_a_few_times_a_minute(monkeypatch: pytest.MonkeyPatch) -> None:
-    stream, now_ns = io.StringIO(), [0]
-    monkeypatch.setattr("reporting.progress_line.time.monotonic_ns", lambda: now_ns[0])
-    with Progress(lambda elapsed_s: f"{elapsed_s:.0f} s", stream) as progress:
-        for second in range(61):
-            now_ns[0] = second * 1_000_000_000
-            progress.tick()
-    assert stream.getvalue().splitlines() == ["0 s", "15 s", "30 s", "45 s", "60 s"]
-
-
 def test_the_trace_is_followed_while_it_is_written(tmp_path: Path) -> None:
     path = tmp_path / "trace.jsonl"
-    followed = TraceTail(path)
+    followed = demo.TraceTail(path)
     followed.update()
     pose = '{"t_ns": %d, "kind": "pose", "x": %f, "y": 0.0}\n'
     path.write_text(pose % (1_000_000_000, 0.0) + '{"t_ns": 2, "kind": "wire", "name": "Move"}\n{"t_ns": 3, "ki')
@@ -339,10 +314,3 @@ def test_the_trace_is_followed_while_it_is_written(tmp_path: Path) -> None:
         stream.write('nd": "wire", "name": "Move"}\n' + pose % (2_100_000_000, 0.5))
     followed.update()
     assert (followed.moves, followed.walked_m) == (2, 0.5)
-
-
-def test_the_last_lines_of_a_log_are_found_in_a_long_file(tmp_path: Path) -> None:
-    path = tmp_path / "long.log"
-    path.write_text("".join(f"line {n}\n\n" for n in range(100_000)))
-    assert last_lines(path, lines=2) == ["line 99998", "line 99999"]
-    assert last_lines(tmp_path / "absent") == []

@@ -54,9 +54,9 @@ def test_an_interrupted_run_of_one_process_continues_to_the_same_trajectories_as
     while not (out / "results.jsonl").exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=30)
-    assert process.returncode == 130, said
-    assert f"continue with --resume --out {out}" in said
+    _, error = process.communicate(timeout=30)
+    assert process.returncode == 130, error
+    assert f"continue with --resume --out {out}" in error
     before = hashes(out)
     assert 1 <= len(before) < len(EPISODES)
     assert cli.main([*arguments, "--resume"]) == 0
@@ -115,7 +115,7 @@ def test_without_an_output_directory_the_result_is_only_told(suite: Path, capsys
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "says"),
+    ("arguments", "code", "message"),
     [
         (("--suite", "nowhere"), 2, "unknown suite 'nowhere'"),
         (("--episodes", "office-*"), 2, "--episodes 'office-*': expected a pattern of ids such as walk-1"),
@@ -131,10 +131,10 @@ def test_without_an_output_directory_the_result_is_only_told(suite: Path, capsys
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else None,
 )
 def test_bad_input_is_one_clear_line_and_its_exit_code(
-    suite: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], code: int, says: str
+    suite: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], code: int, message: str
 ) -> None:
     given = {"--suite": str(suite), "--policy": "still", "--episodes": "walk-1"}
     asked = [part for key, value in given.items() if key not in arguments for part in (key, value)]
     assert cli.main([*asked, *arguments]) == code
-    said = capsys.readouterr().err
-    assert says in said and said.startswith("edge-bench: ") and said.count("\n") == 1
+    error = capsys.readouterr().err
+    assert message in error and error.startswith("edge-bench: ") and error.count("\n") == 1

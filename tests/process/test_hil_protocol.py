@@ -23,12 +23,7 @@ from firmware_bridge.unitree.dds import Bus
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.rpc import RpcClient, RpcError, move_parameter
 from sim_hil.hil.command import main
-from sim_hil.hil.trace import TraceWriter
-from sim_hil.protocols.render_process import CameraProcessError
-from sim_hil.protocols.snapshot import TornSnapshotError
-from sim_hil.protocols.unitree.camera_process import CameraProcess
-from sim_hil.protocols.unitree.services.service import Received
-from sim_hil.protocols.unitree.video_service import ERROR_NO_IMAGE, VideoHub
+from sim_hil.protocols.render_process import CameraProcessError, RenderProcess
 from tests.support.processes import (
     GO2_SIM,
     REPOSITORY,
@@ -39,94 +34,43 @@ from tests.support.processes import (
     running,
     wait_for,
 )
+from tests.support.robot.front_end_contract import options
 
 pytestmark = pytest.mark.process
 
 
-class FakeServer:
-    """A service end with these requests waiting; notes its replies."""
-
-    def __init__(self, *api_ids: int, malformed: int = 0) -> None:
-        self.malformed = malformed
-        self.replies: list[tuple[int, int, bytes]] = []
-        self._waiting = [
-            Received(0, ids.VIDEO_SERVICE, api_id, "", n, noreply=False) for n, api_id in enumerate(api_ids)
-        ]
-
-    def requests(self) -> Iterator[Received]:
-        while self._waiting:
-            yield self._waiting.pop(0)
-
-    def reply(self, request: Received, code: int, data: str = "", binary: bytes = b"") -> None:
-        self.replies.append((request.request_id, code, binary))
-
-
-class TestVideoHub:
-    def test_a_pose_that_cannot_be_read_costs_these_requests_their_picture_and_nothing_else(self) -> None:
-        def render() -> bytes:
-            raise TornSnapshotError("no consistent snapshot")
-
-        server = FakeServer(ids.GET_IMAGE_SAMPLE, ids.GET_IMAGE_SAMPLE)
-        VideoHub(server, render, lambda _event: None).serve()
-        assert server.replies == [(0, ERROR_NO_IMAGE, b""), (1, ERROR_NO_IMAGE, b"")]
-
-    def test_one_render_answers_all_who_wait(self) -> None:
-        renders = []
-        server = FakeServer(ids.GET_IMAGE_SAMPLE, ids.GET_IMAGE_SAMPLE)
-        VideoHub(server, lambda: renders.append(1) or b"jpeg", lambda _event: None).serve()
-        assert server.replies == [(0, 0, b"jpeg"), (1, 0, b"jpeg")] and len(renders) == 1
-
-    def test_the_parent_is_told_once_of_each_malformed_request(self) -> None:
-        told: list[dict[str, object]] = []
-        hub = VideoHub(FakeServer(malformed=2), lambda: b"", told.append)
-        hub.serve()
-        hub.serve()
-        assert told == [{"event": "malformed", "count": 2}]
-
-
-class TestCameraProcess:
+class TestRenderProcess:
     @pytest.fixture
-    def started(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., CameraProcess]:
-        """Starts a camera process that says one line and then waits for the end of its input."""
+    def started(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., RenderProcess]:
+        """Starts a camera process that writes one line and then waits for the end of its input."""
 
-        def start(line: str, then: str = "exec cat") -> CameraProcess:
+        def start(line: str, then: str = "exec cat") -> RenderProcess:
             script = tmp_path / "camera"
             script.write_text(f"#!/bin/sh\nprintf '%b' '{line}'\n{then}\n")
             script.chmod(0o700)
             monkeypatch.setattr(sys, "executable", str(script))
-            dds = DdsConfig(0, "lo", ("127.0.0.1",))
-            return CameraProcess("corridor", people=0, seed=0, size=(64, 48), dds=dds, state_length=19)
+            return RenderProcess("camera", options("go2", camera_size=(64, 48)), [], 19)
 
         return start
 
-    def test_a_stop_request_ends_the_wait_for_it(self, started: Callable[..., CameraProcess]) -> None:
+    def test_a_stop_request_ends_the_wait_for_it(self, started: Callable[..., RenderProcess]) -> None:
         camera = started("")
         assert camera.wait_ready([signal.SIGINT]) is False
         camera.close()
 
     @pytest.mark.slow
-    def test_one_that_hangs_up_and_lives_on_is_not_waited_for(self, started: Callable[..., CameraProcess]) -> None:
+    def test_one_that_hangs_up_and_lives_on_is_not_waited_for(self, started: Callable[..., RenderProcess]) -> None:
         camera = started("", then="exec cat >/dev/null")
         with pytest.raises(CameraProcessError, match="still runs"):
             camera.wait_ready([])
         camera.close()
 
     @pytest.mark.parametrize("line", ["hello", "[1]", '{"event": 1}', "{}", r"\0377", "[" * 4000])
-    def test_a_line_that_is_no_event_is_named(self, started: Callable[..., CameraProcess], line: str) -> None:
+    def test_a_line_that_is_no_event_is_named(self, started: Callable[..., RenderProcess], line: str) -> None:
         camera = started(line + r"\n")
         with pytest.raises(CameraProcessError, match="expected an event"):
             camera.wait_ready([])
         camera.close()
-
-
-def test_the_trace_ends_with_the_summary_and_keeps_the_order(tmp_path: Path) -> None:
-    trace = TraceWriter(tmp_path / "t.jsonl")
-    for index in range(100):
-        trace.put(index, "pose", x=float(index))
-    trace.close(100, fell=False)
-    lines = read_trace(tmp_path / "t.jsonl")
-    assert [line["t_ns"] for line in lines] == list(range(101))
-    assert lines[-1] == {"t_ns": 100, "kind": "end", "fell": False, "trace_dropped": 0}
 
 
 @pytest.fixture(scope="module")
@@ -172,7 +116,7 @@ class TestRealProcess:
                 client.call(api_id, "{}", timeout_s=20)
             assert error.value.code == code
 
-    def test_it_stands_up_and_walks_as_told(self, bus: Bus, reader: Go2Reader) -> None:
+    def test_it_stands_up_and_walks_as_commanded(self, bus: Bus, reader: Go2Reader) -> None:
         client = RpcClient(bus, ids.SPORT_SERVICE)
         client.call(ids.STAND_UP, timeout_s=20)
         wait_for(lambda: reader.state().mode == ids.MODE_JOINT_LOCK, 20, "standing")
@@ -205,7 +149,7 @@ class TestRealProcess:
         assert pictures[0].shape == (180, 320, 3)
         assert float(np.abs(pictures[0].astype(int) - pictures[1]).mean()) > 5
 
-    def test_the_trace_has_what_was_on_the_wire(self, hil: tuple[Running, Path]) -> None:
+    def test_the_trace_contains_the_requests_on_the_wire(self, hil: tuple[Running, Path]) -> None:
         def names() -> list[str]:
             return [line["name"] for line in read_trace(hil[1] / "t.jsonl") if line["kind"] == "wire"]
 
@@ -245,7 +189,7 @@ def _alive(pid: int) -> bool:
 
 
 @pytest.mark.slow
-def test_a_dead_camera_process_ends_the_robot_and_says_so(dds_domain: int, tmp_path: Path) -> None:
+def test_a_dead_camera_process_ends_the_robot_with_an_error(dds_domain: int, tmp_path: Path) -> None:
     with running("sim_hil.hil.command", *hil_arguments(dds_domain), folder=tmp_path) as started:
         os.kill(_camera_pid(started.pid), signal.SIGKILL)
         assert started.process.wait(20) == 1
@@ -284,7 +228,6 @@ def exit_status(command: list[str]) -> int:
         (["--robot", "carter"], "--robot carter --protocol unitree"),
         (["--start", "1,2"], "X,Y,DEG"),
         (["--start", "1000,0,0"], "--start"),
-        (["--link", "udp:1"], "--link"),
         (["--camera", "none", "--faults", "f.sock"], "--camera none"),
         (["--people", "100000"], "people"),
         (["--people", "-1"], "--people"),
@@ -330,7 +273,7 @@ def test_bad_arguments_leave_an_earlier_trace_alone(
     [
         ("Simulation.step", "pybullet.disconnect(args[0].client)"),  # what closing the window does
         ("Simulation.render_state", 'raise pybullet.error("the window was closed")'),
-        ("CameraProcess.wait_ready", 'raise CameraProcessError("the window was closed")'),
+        ("RenderProcess.wait_ready", 'raise CameraProcessError("the window was closed")'),
         ("ServiceServer.serve", 'raise ValueError("the window was closed")'),
     ],
 )
@@ -342,8 +285,7 @@ import sys
 import pybullet
 from sim_hil.hil import command as hil
 from sim_hil.simulation.physics import Simulation
-from sim_hil.protocols.render_process import CameraProcessError
-from sim_hil.protocols.unitree.camera_process import CameraProcess
+from sim_hil.protocols.render_process import CameraProcessError, RenderProcess
 from sim_hil.protocols.unitree.services.service import ServiceServer
 calls = []
 before = {where}
@@ -369,7 +311,7 @@ sys.exit(hil.main(sys.argv[1:]))
 
 
 @pytest.mark.slow
-def test_a_signal_is_heard_while_the_camera_still_starts(dds_domain: int, tmp_path: Path) -> None:
+def test_a_signal_ends_it_while_the_camera_still_starts(dds_domain: int, tmp_path: Path) -> None:
     arguments = map(str, hil_arguments(dds_domain, "--json", tmp_path / "r.json"))
     with subprocess.Popen(
         [sys.executable, "-m", "sim_hil.hil.command", *arguments], cwd=REPOSITORY, stderr=subprocess.PIPE, text=True
@@ -380,9 +322,9 @@ def test_a_signal_is_heard_while_the_camera_still_starts(dds_domain: int, tmp_pa
             hil.children()[0].suspend()  # a camera that never gets ready
             time.sleep(0.2)
             process.terminate()
-            _, said = process.communicate(timeout=20)
+            _, error = process.communicate(timeout=20)
         finally:
             process.kill()
-    assert process.returncode == 0, said
-    assert "ready" not in said
+    assert process.returncode == 0, error
+    assert "ready" not in error
     assert json.loads((tmp_path / "r.json").read_text())["duration_s"] == 0.0

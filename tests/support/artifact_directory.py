@@ -9,16 +9,17 @@ from pathlib import Path
 from typing import Any
 
 from edge.artifacts.files import MANIFEST_NAME, SCHEMA_VERSION, seal
-from export.graphs.build import graph_contract, graph_names, write_graph
+from export.graphs.build import graph_contract, write_graph
 from export.model.network import TicVla
 from export.model.tokenizers.nano import NANO_TOKENIZER
 from export.quantize.precision import Precision
+from export.targets.file import graph_names
 
 
 def write_artifacts(model: TicVla, directory: Path, *, pair: bool = False, precision: Precision | None = None) -> Path:
     """The graphs of a model with nano's tokenizer, in one precision, and a manifest that lists them."""
     config, graphs = model.config, {}
-    for name in graph_names(pair):
+    for name in graph_names(pair=pair):
         files = write_graph(model, name, precision or Precision("fp32"), "fused", directory)
         session = {"provider": "CPUExecutionProvider", "options": {}, "threads": None, "engine": False}
         graphs[name] = {

@@ -11,8 +11,7 @@ from safetensors.numpy import save_file
 
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE
 from tools.findings.models import main, models_of
-from tools.train.config.recipe import load_recipe
-from tools.train.config.variants import VARIANTS
+from tools.train.config.recipe import VARIANTS, load_recipe
 
 
 def run_of(folder: Path, *stages: str, variant: str = "full", policy: float | None = None) -> Path:
@@ -52,7 +51,7 @@ def test_without_a_policy_of_its_own_ppo_has_left_imitations(stages: tuple[str, 
     assert found == dict.fromkeys(("no-rl", "rl"), run / "imitate" / "model.safetensors")
 
 
-def test_that_ppo_has_left_nothing_is_said(tmp_path: Path, command: list[str], capsys: Any) -> None:
+def test_a_run_without_a_policy_of_ppo_is_reported(tmp_path: Path, command: list[str], capsys: Any) -> None:
     assert main(["--run", str(run_of(tmp_path / "run", "imitate")), "--out", str(tmp_path / "m")], command) == EXIT_DONE
     assert "rl: reinforcement learning has left no policy of its own" in capsys.readouterr().err
 
@@ -63,15 +62,10 @@ def test_every_model_has_a_folder_of_its_own(tmp_path: Path, command: list[str])
     assert {path.parent.name for path in (tmp_path / "models").glob("*/manifest.json")} == {"rl", "no-rl"}
 
 
-@pytest.mark.parametrize("stages", [(), ("collect",)])
-def test_a_run_without_weights_is_said(
-    stages: tuple[str, ...], tmp_path: Path, command: list[str], capsys: Any
+@pytest.mark.parametrize(("is_run", "message"), [(True, "has no weights yet"), (False, "holds no run of edge-train")])
+def test_a_folder_without_weights_is_refused(
+    is_run: bool, message: str, tmp_path: Path, command: list[str], capsys: Any
 ) -> None:
-    run = run_of(tmp_path / "run", *stages)
+    run = run_of(tmp_path / "run", "collect") if is_run else tmp_path
     assert main(["--run", str(run), "--out", str(tmp_path / "models")], command) == EXIT_BAD_INPUT
-    assert "has no weights yet" in capsys.readouterr().err
-
-
-def test_a_folder_that_is_no_run_is_said(tmp_path: Path, command: list[str], capsys: Any) -> None:
-    assert main(["--run", str(tmp_path), "--out", str(tmp_path / "models")], command) == EXIT_BAD_INPUT
-    assert "holds no run of edge-train" in capsys.readouterr().err
+    assert message in capsys.readouterr().err

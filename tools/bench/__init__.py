@@ -1,1 +1,22 @@
 """Benchmarks that print one table each: `python -m tools.bench.NAME`."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from edge.core.cli import EXIT_BAD_INPUT
+
+
+def command_parser(page: str | None, *, artifacts: bool = False) -> argparse.ArgumentParser:
+    """A parser with the module's page as its help and the options that benchmarks share."""
+    p = argparse.ArgumentParser(description=page, formatter_class=argparse.RawDescriptionHelpFormatter)
+    if artifacts:
+        p.add_argument("--artifacts", type=Path, required=True, metavar="DIR", help="artifact directory")
+    p.add_argument("--json", metavar="FILE|-", help="write figures and samples as JSON")
+    return p
+
+
+def bad_input(name: str, error: Exception) -> int:
+    """Report bad arguments or input in one line; returns the exit code."""
+    sys.stderr.write(f"{name}: {error}\n")
+    return EXIT_BAD_INPUT

@@ -10,8 +10,6 @@ Generations follow one another without a pause while they are allowed. A tick is
 
 from __future__ import annotations
 
-import argparse
-import contextlib
 import itertools
 import sys
 import time
@@ -25,7 +23,7 @@ import numpy.typing as npt
 from rich.console import Console
 from rich.table import Table
 
-from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
+from edge.core.cli import EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
 from edge.core.geometry import SE2
 from edge.flightlog.reader import RecordingError, read_messages
 from edge.inference.policy import Policy
@@ -34,7 +32,9 @@ from edge.reasoning.generation_cycle import UNLIMITED, ReasoningBudget
 from edge.run import command as runner
 from edge.state.semantic import SemanticState
 from sim_hil.realtime.children import Children, StepError
-from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_FILE, free_domain, socket_dir
+from sim_hil.realtime.stack import socket_dir
+from tools.bench import bad_input, command_parser
+from tools.bench.stop import start_robot
 from tools.demo import INSTRUCTION
 from tools.faults import circle
 
@@ -114,27 +114,17 @@ def block_ratios(ticks: Sequence[Tick]) -> list[float]:
     return [medians[on] / medians[off] for on, off in pairs]
 
 
-def _quantile(values: npt.NDArray[np.float64], share: float) -> float:
-    return float(np.percentile(values, 100 * share, method="inverted_cdf"))
-
-
 def summarise(ticks: Sequence[Tick], missed: int, generations: int, busy: float) -> dict[str, object]:
     """Figures and verdicts; raises ValueError for a log without both phases."""
     figures: dict[str, dict[str, float]] = {}
-    for name, chosen in (
-        ("all", list(ticks)),
-        ("reasoning", [tick for tick in ticks if tick.reasoning is True]),
-        ("alone", [tick for tick in ticks if tick.reasoning is False]),
-    ):
-        if not chosen:
+    phases = {"all": (True, False, None), "reasoning": (True,), "alone": (False,)}
+    for name, phase in phases.items():
+        values = np.array([tick.tick_ms for tick in ticks if tick.reasoning in phase])
+        if not len(values):
             raise ValueError(f"no ticks of the phase {name!r}: drive for at least {3 * BLOCK_S:g} s")
-        values = np.array([tick.tick_ms for tick in chosen])
-        quantiles = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
-        figures[name] = {
-            "n": len(values),
-            **{key: round(_quantile(values, share), 3) for key, share in quantiles.items()},
-        }
-        figures[name]["max"] = round(float(values.max()), 3)
+        quantiles = np.percentile(values, (50, 99, 99.9, 100), method="inverted_cdf")
+        named = zip(("p50", "p99", "p999", "max"), (round(float(value), 3) for value in quantiles), strict=True)
+        figures[name] = {"n": len(values), **dict(named)}
     ratios = block_ratios(ticks)
     ratio = float(np.median(ratios)) if ratios else figures["reasoning"]["p50"] / figures["alone"]["p50"]
     checks = {
@@ -157,14 +147,8 @@ def summarise(ticks: Sequence[Tick], missed: int, generations: int, busy: float)
 
 
 def _run(artifacts: Path, duration_s: float, folder: Path) -> tuple[list[Tick], int, float, int]:
-    with contextlib.ExitStack() as stack:
-        children = stack.enter_context(Children(folder))
-        domain = ["--domain", str(free_domain())]
-        link = ["--robot", str(ROBOT_FILE), "--socket", str(folder / "b.sock"), *domain]
-        scene = ["--robot", "go2", "--scene", "corridor", "--protocol", "unitree", "--people", "0"]
-        hil = children.start("edge-hil", [*COMMANDS["edge-hil"], *scene, *domain])
-        children.wait_until(hil, lambda: READY_LINE in hil.log.read_text(), 90.0, "ready line", lambda: None)
-        children.start("edge-bridge", [*COMMANDS["edge-bridge"], *link])
+    with Children(folder) as children:
+        link = start_robot(children, folder)
         log = folder / "flight.mcap"
         run = [sys.executable, "-m", "tools.bench.contention", DRIVE, *link, "--artifacts", str(artifacts)]
         run += ["--instruction", INSTRUCTION, "--duration", str(duration_s), "--record", str(log)]
@@ -183,10 +167,8 @@ def main(argv: list[str] | None = None) -> int:
     arguments = sys.argv[1:] if argv is None else argv
     if arguments[:1] == [DRIVE]:
         return drive(arguments[1:])
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("--artifacts", type=Path, required=True, metavar="DIR")
+    p = command_parser(__doc__, artifacts=True)
     p.add_argument("--duration", type=float, default=600.0, metavar="S", help="default: 600")
-    p.add_argument("--json", metavar="FILE|-")
     args = p.parse_args(arguments)
     try:
         check_result_target(args.json)
@@ -195,8 +177,7 @@ def main(argv: list[str] | None = None) -> int:
         result = summarise(ticks, missed, generations, busy)
         write_result(args.json, {**result, "samples": [list(asdict(tick).values()) for tick in ticks]})
     except (StepError, RecordingError, OSError, ValueError) as error:
-        sys.stderr.write(f"{error}\n")
-        return EXIT_BAD_INPUT
+        return bad_input("contention", error)
     _print(result)
     return EXIT_DONE if result["ok"] else EXIT_CHECK_FAILED
 

@@ -9,7 +9,6 @@ motion offset, the estimator's, and the truth. Exit code 1 when a bound of `GATE
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 import time
@@ -23,13 +22,15 @@ from typing import Any
 import cv2
 import numpy as np
 
-from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
+from edge.core.cli import EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
 from edge.core.geometry import SE2, wrap_angle
 from edge.odometry.drift_rate import Comparison, DriftMonitor
 from edge.odometry.estimator import DriftEstimator
 from edge.odometry.gate import OdometryInputs
+from reporting.progress import Progress
 from sim_hil.robots.odometry_noise import LEVELS, OdometryNoise
 from sim_hil.scene.scene import load_scene
+from tools.bench import bad_input, command_parser
 from tools.bench.sim.drift_runs import CAMERA_DELAY_NS, STAND_S, STATE_NS, SensorNoise, Walk, record_walk
 
 WINDOW_NS = 5_000_000_000
@@ -301,14 +302,13 @@ def _table(summary: dict[str, Any]) -> str:
 @command_line("drift")
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = command_parser(__doc__)
     p.add_argument("--walks", type=int, default=50, metavar="N", help="walks, each at both levels (default 50)")
     p.add_argument("--seed", type=int, default=0, metavar="N", help="of the first walk (default 0)")
     p.add_argument("--distance", type=float, default=23.0, metavar="M", help="path of a walk (default 23)")
     p.add_argument("--people", type=int, default=1, metavar="N", help="walking people (default 1)")
     p.add_argument("--scene", default="corridor", metavar="NAME")
     p.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default 1)")
-    p.add_argument("--json", metavar="FILE|-")
     args = p.parse_args(argv)
     try:
         if args.walks < 1 or args.jobs < 1 or not RATE_AFTER_M < args.distance <= 500:
@@ -316,20 +316,20 @@ def main(argv: list[str] | None = None) -> int:
         check_result_target(args.json)
         load_scene(args.scene)
     except (ValueError, OSError) as error:
-        sys.stderr.write(f"drift: {error}\n")
-        return EXIT_BAD_INPUT
+        return bad_input("drift", error)
     job = partial(walk_and_replay, scene=args.scene, people=args.people, distance_m=args.distance)
     seeds = range(args.seed, args.seed + args.walks)
     runs: list[DriftRun] = []
     cameras: list[dict[str, float]] = []
     # Spawned, not forked: a physics client does not survive a fork.
-    with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool:
+    with (
+        ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool,
+        Progress("drift: ", bar=True) as progress,
+    ):
         for done, (walked, camera) in enumerate(pool.map(job, seeds), 1):
             runs += walked
             cameras.append(camera)
-            sys.stderr.write(f"\rwalk {done}/{args.walks}")
-            sys.stderr.flush()
-    sys.stderr.write("\n")
+            progress.show("walks", done, args.walks)
     summary: dict[str, Any] = {level: summarise([run for run in runs if run.level == level]) for level in TESTED}
     summary["camera"] = {
         "frames": sum(camera["frames"] for camera in cameras),

@@ -12,7 +12,6 @@ reasoning was shed where it need not be. Everything here is modelled.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import math
 import random
@@ -21,13 +20,14 @@ import time
 from dataclasses import dataclass
 from typing import Any, Final
 
-from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
+from edge.core.cli import EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
 from edge.power.governor.governor import Governor, GovernorConfig, GovernorInputs, GovernorOutputs
 from edge.power.governor.plan import PowerPlan, power_plan
 from edge.reasoning.generation_cycle import UNLIMITED, ReasoningBudget
 from export.model.config import PRESETS
 from export.plan.plan import plan
-from export.target.file import load_target
+from export.targets.file import load_target
+from tools.bench import bad_input, command_parser
 
 WINDOW_S, SETTLE_S, TOLERANCE, LENGTH_S = 10.0, 30.0, 0.02, 600.0
 NOISE, LOST = 0.02, 0.01
@@ -146,7 +146,7 @@ class Run:
 
 
 def simulate(load: str, *, seconds: float = LENGTH_S, seed: int = 0, governed: bool = True) -> Run:
-    """Drive the governor on the modelled device for that long; `governed` off: nobody reads what it says."""
+    """Drive the governor on the modelled device for that long; `governed` off: its budget is ignored."""
     stages, power = orin()
     budget_w = power.budget_w or math.nan
     factor = load_factor(load, stages, budget_w)
@@ -236,18 +236,16 @@ def judge(load: str, run: Run, budget_w: float, period_s: float = 0.1) -> dict[s
 @command_line("governor")
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = command_parser(__doc__)
     p.add_argument("--seconds", type=float, default=LENGTH_S, help="modelled length of each run (default: 600)")
     p.add_argument("--seed", type=int, default=0, help="of noise and texts (default: 0)")
-    p.add_argument("--json", metavar="FILE|-", help="figures and raw samples")
     args = p.parse_args(argv)
     try:
         check_result_target(args.json)
         if not SETTLE_S < args.seconds <= 36_000:
             raise ValueError(f"--seconds {args.seconds:g}: expected more than {SETTLE_S:g} and at most 36000")
     except (OSError, ValueError) as error:
-        sys.stderr.write(f"governor: {error}\n")
-        return EXIT_BAD_INPUT
+        return bad_input("governor", error)
     budget_w = orin()[1].budget_w or math.nan
     loads: dict[str, Any] = {}
     samples: dict[str, Any] = {}

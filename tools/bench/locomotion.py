@@ -10,7 +10,6 @@ processor buys. `--rate` is the physics' rate: 500 Hz is edge-hil's. Exit code 1
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import sys
 from collections.abc import Callable, Sequence
@@ -21,10 +20,9 @@ from math import degrees
 from multiprocessing import get_context
 from typing import Any
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
+from edge.core.cli import EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
+from reporting.progress import Progress
+from tools.bench import bad_input, command_parser
 from tools.bench.sim.locomotion_runs import (
     PUSHES,
     ROUTES,
@@ -77,21 +75,19 @@ def _run(job: Job) -> object:
     return job.call(*job.args)
 
 
-def run_all(jobs: Sequence[Job], processes: int, console: Console) -> dict[str, list[Any]]:
+def run_all(jobs: Sequence[Job], processes: int) -> dict[str, list[Any]]:
     """Results by part, in the order of the jobs; nothing else runs beside the measurements of speed."""
     results: dict[str, list[Any]] = {part: [] for part in ("flat", "ground", "endurance", "pushes", "speed")}
-    columns = (TextColumn("{task.description:10s}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
-    with Progress(*columns, TimeElapsedColumn(), console=console) as progress:
+    with Progress("locomotion: ", bar=True) as progress:
         for together in (True, False):
             chosen = [job for job in jobs if (job.part != "speed") == together]
             if not chosen:
                 continue
-            bar = progress.add_task("walks" if together else "speed", total=len(chosen))
             # Spawned, not forked: a physics client does not survive a fork.
             with ProcessPoolExecutor(processes if together else 1, mp_context=get_context("spawn")) as pool:
-                for job, result in zip(chosen, pool.map(_run, chosen), strict=True):
+                for done, (job, result) in enumerate(zip(chosen, pool.map(_run, chosen), strict=True), 1):
                     results[job.part].append(result)
-                    progress.advance(bar)
+                    progress.show("walks" if together else "speed", done, len(chosen))
     return results
 
 
@@ -145,21 +141,16 @@ def _speeds(speeds: Sequence[Speed]) -> dict[int, list[Speed]]:
     return {rate: chosen for rate in SPEED_RATES_HZ if (chosen := [s for s in speeds if s.rate_hz == rate])}
 
 
-def _parser() -> argparse.ArgumentParser:
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+@command_line("locomotion")
+def main(argv: list[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    p = command_parser(__doc__)
     p.add_argument("--rate", type=int, default=500, metavar="HZ", help="steps of physics a second (default 500)")
     p.add_argument("--minutes", type=float, default=30.0, metavar="M", help="of random commands per seed (default 30)")
     p.add_argument("--seeds", type=int, default=3, metavar="N", help="random walks (default 3)")
     p.add_argument("--repeats", type=int, default=5, metavar="N", help="measurements of speed (default 5, 0: none)")
     p.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default 1)")
-    p.add_argument("--json", metavar="FILE|-", help="write every row")
-    return p
-
-
-@command_line("locomotion")
-def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    args = _parser().parse_args(argv)
+    args = p.parse_args(argv)
     try:
         if not 200 <= args.rate <= 1000:
             raise ValueError(f"--rate: expected 200..1000, found {args.rate}")
@@ -167,10 +158,9 @@ def main(argv: list[str] | None = None) -> int:
             raise ValueError("expected --minutes, --seeds and --repeats of 0 or more and --jobs of 1 or more")
         check_result_target(args.json)
     except (ValueError, OSError) as error:
-        sys.stderr.write(f"locomotion: {error}\n")
-        return EXIT_BAD_INPUT
+        return bad_input("locomotion", error)
     jobs = plan(args.rate, args.minutes, range(args.seeds), args.repeats)
-    results = run_all(jobs, args.jobs, Console(stderr=True))
+    results = run_all(jobs, args.jobs)
     kept = all(result.kept for part in ("flat", "ground", "endurance", "pushes") for result in results[part])
     (sys.stderr if args.json == "-" else sys.stdout).write(table(results) + "\n")
     rows = {part: [{**asdict(result), "kept": getattr(result, "kept", None)} for result in results[part]]

@@ -9,7 +9,6 @@ The last-layer keys and values compared are those of the prompt. Exit code 1 whe
 
 from __future__ import annotations
 
-import argparse
 import multiprocessing
 import resource
 import sys
@@ -27,16 +26,18 @@ from rich.console import Console
 from rich.table import Table
 from tokenizers import Tokenizer
 
-from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
+from edge.core.cli import EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
 from edge.core.geometry import SE2
 from edge.reasoning.prompt import EXAMPLE_BEFORE, EXAMPLE_WAY, PromptBuilder, PromptIds
 from edge.state.ring import EncodedFrame
-from export.checkpoint import load_checkpoint, tokenizer_for
+from export.checkpoint.load import load_checkpoint
+from export.checkpoint.tokenizer import tokenizer_for
+from export.evaluation.task_error import cosine
 from export.graphs.build import write_graph
 from export.graphs.language import cache_names
-from export.model.config import TicVlaConfig
-from export.model.config_file import config_for
+from export.model.config import TicVlaConfig, config_for
 from export.quantize.precision import Precision
+from tools.bench import bad_input, command_parser
 
 Arrays = dict[str, npt.NDArray[Any]]
 
@@ -49,7 +50,7 @@ GRAPHS = ("vision_encoder", "language_model")
 
 @dataclass(frozen=True)
 class Work:
-    """What every process is told."""
+    """Arguments of every process."""
 
     directory: Path
     model: str
@@ -81,12 +82,12 @@ class Work:
         ]
 
 
-def hugging_face(work: Work) -> Arrays:
-    """Make the checkpoint, then compute everything with transformers in fp32."""
-    from transformers import InternVLConfig, InternVLForConditionalGeneration
+def internvl_config(network: TicVlaConfig, *, tied: bool = False) -> Any:
+    """The configuration by which transformers builds our network."""
+    from transformers import InternVLConfig
 
-    v, c = work.config.vision, work.config.language
-    config = InternVLConfig(
+    v, c = network.vision, network.language
+    return InternVLConfig(
         vision_config={
             "hidden_size": v.hidden,
             "num_hidden_layers": v.layers,
@@ -106,12 +107,20 @@ def hugging_face(work: Work) -> Arrays:
             "intermediate_size": c.mlp,
             "vocab_size": c.vocab,
             "rope_parameters": {"rope_theta": c.rope_theta, "rope_type": "dynamic", "factor": 2.0},
-            "tie_word_embeddings": False,
+            "tie_word_embeddings": tied,
         },
         image_token_id=c.img_context_id,
         image_seq_length=v.tokens,
-        tie_word_embeddings=False,
+        tie_word_embeddings=tied,
     )
+
+
+def hugging_face(work: Work) -> Arrays:
+    """Make the checkpoint, then compute everything with transformers in fp32."""
+    from transformers import InternVLForConditionalGeneration
+
+    v = work.config.vision
+    config = internvl_config(work.config)
     torch.manual_seed(work.seed)
     model = InternVLForConditionalGeneration(config).eval()
     with torch.no_grad():
@@ -243,12 +252,6 @@ def in_own_process(name: str, work: Work) -> dict[str, npt.NDArray[Any]]:
         return dict(file)
 
 
-def cosine(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> float:
-    """Cosine of two arrays as vectors, in fp64."""
-    a, b = a.astype(np.float64).ravel(), b.astype(np.float64).ravel()
-    return float(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)))
-
-
 def compare(theirs: Arrays, ours: Arrays) -> dict[str, Any]:
     """Every measure, its bound and whether it is kept."""
     rows: dict[str, Any] = {}
@@ -288,13 +291,12 @@ def show(result: dict[str, Any]) -> None:
 @command_line("parity_1b")
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = command_parser(__doc__)
     p.add_argument("--model", default="1b", help="1b, or a .json file with InternVL3's vocabulary")
     p.add_argument("--frames", type=int, default=4)
     p.add_argument("--new-tokens", type=int, default=64)
     p.add_argument("--seed", type=int, default=0)
     p.add_argument("--threads", type=int, default=2)
-    p.add_argument("--json", metavar="FILE|-")
     args = p.parse_args(argv)
     try:
         check_result_target(args.json)
@@ -309,8 +311,7 @@ def main(argv: list[str] | None = None) -> int:
                 raise ValueError(f"{length} tokens, the model reads {work.config.language.max_context}")
             arrays = {name: in_own_process(name, work) for name in STAGES}
     except (ValueError, OSError, ImportError) as error:
-        sys.stderr.write(f"parity_1b: {error}\n")
-        return EXIT_BAD_INPUT
+        return bad_input("parity_1b", error)
     theirs = arrays.pop("transformers")
     compared = {name: compare(theirs, ours) for name, ours in arrays.items()}
     processes = {

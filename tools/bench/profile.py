@@ -5,7 +5,6 @@ python -m tools.bench.profile --artifacts out/cpu --graphs language_model.decode
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import tempfile
@@ -18,8 +17,9 @@ import onnxruntime as ort
 
 from edge.artifacts.files import ArtifactError
 from edge.artifacts.manifest import Artifacts, load_artifacts
-from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, command_line, write_result
+from edge.core.cli import EXIT_DONE, command_line, write_result
 from edge.inference.graph import DTYPES, Array
+from tools.bench import bad_input, command_parser
 
 CALLS = {"vision_encoder": 5, "language_model": 10, "language_model.prefill": 5, "language_model.decode": 40}
 KERNEL = "_kernel_time"
@@ -89,12 +89,10 @@ def profile(artifacts: Artifacts, name: str, *, context: int, threads: int) -> d
 @command_line("profile")
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("--artifacts", type=Path, required=True, metavar="DIR")
+    p = command_parser(__doc__, artifacts=True)
     p.add_argument("--graphs", nargs="*", metavar="NAME", help="graphs to profile (default: all)")
     p.add_argument("--context", type=int, default=1100, help="tokens before the new one (default: 1100)")
     p.add_argument("--threads", type=int, default=2)
-    p.add_argument("--json", metavar="FILE|-")
     args = p.parse_args(argv)
     try:
         artifacts = load_artifacts(args.artifacts.absolute())
@@ -107,8 +105,7 @@ def main(argv: list[str] | None = None) -> int:
         result = {name: profile(artifacts, name, context=args.context, threads=args.threads) for name in names}
         write_result(args.json, result)
     except (ArtifactError, OSError) as error:
-        sys.stderr.write(f"{error}\n")
-        return EXIT_BAD_INPUT
+        return bad_input("profile", error)
     if args.json != "-":
         for name, found in result.items():
             print(f"{name}: {found['total_ms']:.2f} ms a call, {args.threads} threads")

@@ -32,10 +32,18 @@ from rich.table import Table
 from edge.artifacts.files import ArtifactError
 from edge.artifacts.manifest import load_artifacts
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, command_line, write_result, write_whole
-from tools.bench.peers.contenders import EVERYTHING, OURS, OWN_STACK, Contender, chosen
-from tools.bench.peers.process import ROOT, MemoryWatch, Peak, Worker, WorkerError, worker_command
-from tools.bench.peers.rounds import Round, run_rounds
-from tools.bench.peers.summary import Verdict, judge_all, markdown, verdict_text
+from tools.bench.peers.contenders import (
+    EVERYTHING,
+    OURS,
+    OWN_STACK,
+    Contender,
+    Verdict,
+    chosen,
+    judge_all,
+    markdown,
+    verdict_text,
+)
+from tools.bench.peers.rounds import ROOT, MemoryWatch, Peak, Round, Worker, WorkerError, run_rounds, worker_command
 from tools.bench.peers.workload import Workload
 
 INSTALL = "tools/bench/peers/install.sh"
@@ -85,17 +93,8 @@ class Bench:
         options = dict(contender.options)
         if contender.stack == OURS:
             options = {"artifacts": str(self.args.artifacts.resolve())}
-        answer = worker.ask(
-            {
-                "load": {
-                    "model": self.model,
-                    "cache": str(self.args.cache.resolve()),
-                    "threads": self.args.threads,
-                    "parts": contender.parts,
-                    "options": options,
-                }
-            }
-        )
+        load = {"model": self.model, "cache": str(self.args.cache.resolve()), "threads": self.args.threads}
+        answer = worker.ask({"load": {**load, "parts": contender.parts, "options": options}})
         self.versions[contender.name] = answer["versions"]
         return list(answer["tasks"])
 

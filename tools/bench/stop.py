@@ -1,4 +1,4 @@
-"""How soon the robot hears zero velocity when the runner is killed or frozen while it drives.
+"""How soon the robot receives zero velocity when the runner is killed or frozen while it drives.
 
     python -m tools.bench.stop --artifacts out/demo/artifacts --runs 20 --json out/bench/stop.json
 
@@ -8,18 +8,19 @@ judge is the simulated robot's own trace of what it received: the figure is sign
 
 from __future__ import annotations
 
-import argparse
 import json
 import random
 import signal
 import statistics
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
-from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
+from edge.core.cli import EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
 from sim_hil.realtime.children import Child, Children, StepError
 from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_FILE, free_domain, socket_dir
+from tools.bench import bad_input, command_parser
 from tools.demo import INSTRUCTION
 
 SIGNALS = (signal.SIGKILL, signal.SIGSTOP)
@@ -52,6 +53,17 @@ def lasting_zero_ms(moves: Moves, signal_ns: int) -> float:
     return (after[last_motion + 1][0] - signal_ns) / 1e6
 
 
+def start_robot(children: Children, folder: Path, options: Sequence[str] = ()) -> list[str]:
+    """Start edge-hil with its options and edge-bridge; returns the arguments by which a runner finds them."""
+    domain = ["--domain", str(free_domain())]
+    link = ["--robot", str(ROBOT_FILE), "--socket", str(folder / "b.sock"), *domain]
+    scene = ["--robot", "go2", "--scene", "corridor", "--protocol", "unitree", "--people", "0"]
+    hil = children.start("edge-hil", [*COMMANDS["edge-hil"], *scene, *options, *domain])
+    children.wait_until(hil, lambda: READY_LINE in hil.log.read_text(), 90.0, "ready line", lambda: None)
+    children.start("edge-bridge", [*COMMANDS["edge-bridge"], *link])
+    return link
+
+
 def stop_once(children: Children, runner: list[str], trace: Path, number: signal.Signals, driving_s: float) -> float:
     """Start a runner, let it drive, send the signal; returns the latency in ms."""
     child: Child = children.start("edge-run", runner)
@@ -74,10 +86,8 @@ def stop_once(children: Children, runner: list[str], trace: Path, number: signal
 @command_line("stop")
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("--artifacts", type=Path, required=True, metavar="DIR")
+    p = command_parser(__doc__, artifacts=True)
     p.add_argument("--runs", type=int, default=20, help="runs of each signal (default: 20)")
-    p.add_argument("--json", metavar="FILE|-")
     args = p.parse_args(argv)
     rng = random.Random(0)
     samples: dict[str, list[float]] = {number.name: [] for number in SIGNALS}
@@ -86,12 +96,8 @@ def main(argv: list[str] | None = None) -> int:
         if args.runs < 1:
             raise ValueError(f"--runs {args.runs}: expected at least 1")
         with socket_dir() as folder, Children(folder) as children:
-            trace, domain = folder / "trace.jsonl", ["--domain", str(free_domain())]
-            link = ["--robot", str(ROBOT_FILE), "--socket", str(folder / "b.sock"), *domain]
-            scene = ["--robot", "go2", "--scene", "corridor", "--protocol", "unitree", "--people", "0"]
-            hil = children.start("edge-hil", [*COMMANDS["edge-hil"], *scene, "--trace", str(trace), *domain])
-            children.wait_until(hil, lambda: READY_LINE in hil.log.read_text(), 90.0, "ready line", lambda: None)
-            children.start("edge-bridge", [*COMMANDS["edge-bridge"], *link])
+            trace = folder / "trace.jsonl"
+            link = start_robot(children, folder, ["--trace", str(trace)])
             runner = [*COMMANDS["edge-run"], *link, "--artifacts", str(args.artifacts), "--instruction", INSTRUCTION]
             for index in range(args.runs):
                 for number in SIGNALS:
@@ -99,8 +105,7 @@ def main(argv: list[str] | None = None) -> int:
                     samples[number.name].append(latency_ms)
                     sys.stderr.write(f"run {index + 1}/{args.runs}: {number.name} {latency_ms:.1f} ms\n")
     except (StepError, OSError, ValueError) as error:
-        sys.stderr.write(f"{error}\n")
-        return EXIT_BAD_INPUT
+        return bad_input("stop", error)
     summary = {
         name: {"n": len(values), "p50": statistics.median(values), "max": max(values)}
         for name, values in samples.items()

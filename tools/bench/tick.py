@@ -8,7 +8,6 @@ both. `--core` pins the process, which makes "one core" literal.
 
 from __future__ import annotations
 
-import argparse
 import os
 import statistics
 import sys
@@ -22,12 +21,13 @@ from numpy.typing import NDArray
 
 from edge.artifacts.files import ArtifactError, read_manifest
 from edge.artifacts.manifest import load_artifacts
-from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, command_line, write_result
+from edge.core.cli import EXIT_DONE, command_line, write_result
 from edge.core.geometry import SE2
 from edge.inference.policy import Policy
 from edge.state.semantic import SemanticState
-from export.model.config_file import config_for
+from export.model.config import config_for
 from export.model.network import build
+from tools.bench import bad_input, command_parser
 
 HERE = SE2(0.0, 0.0, 0.0)
 
@@ -59,12 +59,10 @@ def torch_tick(model_name: str, image: NDArray[np.uint8], kv: NDArray[np.float32
 @command_line("tick")
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("--artifacts", type=Path, required=True, metavar="DIR")
+    p = command_parser(__doc__, artifacts=True)
     p.add_argument("--rounds", type=int, default=100)
     p.add_argument("--tokens", type=int, default=200, help="tokens of the semantic state (default: 200)")
     p.add_argument("--core", type=int, default=0, help="processor to pin to (default: 0)")
-    p.add_argument("--json", metavar="FILE|-")
     args = p.parse_args(argv)
     rng = np.random.default_rng(0)
     try:
@@ -76,8 +74,7 @@ def main(argv: list[str] | None = None) -> int:
         if args.tokens > artifacts.runtime.max_context:
             raise ArtifactError(f"--tokens {args.tokens}: the model reads {artifacts.runtime.max_context}")
     except (ArtifactError, OSError) as error:
-        sys.stderr.write(f"{error}\n")
-        return EXIT_BAD_INPUT
+        return bad_input("tick", error)
     px = artifacts.runtime.image_px
     image = rng.integers(0, 256, (1, px, px, 3)).astype(np.uint8)
     kv = rng.standard_normal((1, args.tokens, artifacts.runtime.kv_dim)).astype(np.float32)

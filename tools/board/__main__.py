@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, command_line, messages, write_result
 from tools.board import drive as board_drive
 from tools.board.root import RootError, inside, make_root, mounted, run
 
@@ -29,27 +29,20 @@ ROBOT: Final = REPOSITORY / "firmware_bridge/robots/go2_sim.toml"
 QUIET: Final = ("cpuinfo", "cpuid_info")  # ONNX Runtime about the emulated processor
 
 
+@command_line("board", {RootError: EXIT_BAD_INPUT})
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = _parser().parse_args(argv)
     args.out.mkdir(parents=True, exist_ok=True)
     for path in (args.artifacts / "manifest.json", args.flight):
         if not path.is_file():
-            sys.stderr.write(f"board: {path}: no such file\n")
+            messages("board")(f"{path}: no such file")
             return EXIT_BAD_INPUT
-    try:
-        make_root(args.root)
-        _copy(args)
-        with mounted(args.root):
-            results = list(_steps(args))
-    except (RootError, OSError) as error:
-        sys.stderr.write(f"board: {error}\n")
-        return EXIT_BAD_INPUT
-    except KeyboardInterrupt:
-        return EXIT_INTERRUPTED
-    (args.out / "result.json").write_text(
-        json.dumps({"tagged": "measured, emulated", "steps": results}, indent=1) + "\n"
-    )
+    make_root(args.root)
+    _copy(args)
+    with mounted(args.root):
+        results = list(_steps(args))
+    write_result(str(args.out / "result.json"), {"tagged": "measured, emulated", "steps": results})
     return EXIT_DONE if all(step["passed"] for step in results) else EXIT_CHECK_FAILED
 
 
@@ -63,7 +56,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--flight", type=Path, required=True, metavar="FILE.mcap", help="a log recorded with them here")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for result and transcript")
-    parser.add_argument("--replay-to", type=float, default=2.0, metavar="S", help="seconds of the log to replay (2)")
+    parser.add_argument("--replay-to", type=float, default=4.0, metavar="S", help="seconds of the log to replay (4)")
     parser.add_argument("--domain", type=int, default=91, help="DDS domain of the drive (91)")
     return parser
 

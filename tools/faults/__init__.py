@@ -1,1 +1,1 @@
-"""`python -m tools.faults`: make everything go wrong that may, and measure at the robot how soon it is told to stop."""
+"""`python -m tools.faults`: inject every fault and measure at the robot how soon it receives the stop."""

@@ -1,4 +1,4 @@
-"""Inject every fault into real processes on loopback and measure, on the robot's side, how soon the robot is stopped.
+"""Inject every fault into real processes on loopback and measure, on the robot's side, how soon the robot stops.
 
 edge-hil, edge-bridge and edge-run run as a user would start them (edge-run with a plan that keeps the robot moving, and
 with switches for faults inside it). The judge is a sniffer, a process of its own that stamps what reaches the robot.
@@ -25,10 +25,11 @@ from edge.core.cli import (
     EXIT_INTERRUPTED,
     check_result_target,
     command_line,
+    messages,
     write_result,
 )
 from edge.flightlog.recorder import space_refusal
-from sim_hil.protocols.fault_client import FaultError
+from sim_hil.protocols.fault_socket import FaultError
 from sim_hil.realtime.children import StepError, uninterrupted
 from sim_hil.realtime.stack import free_domain, socket_dir
 from tools.faults.host_stall import HostStall
@@ -37,6 +38,8 @@ from tools.faults.report import RowResult, result, show
 from tools.faults.rig import Rig
 from tools.faults.rows import Judge, Row, rows
 from tools.report.machine import machine_facts
+
+_print = messages("faults")
 
 EXAMPLES = """examples:
   python -m tools.faults --artifacts out/nano --out out/faults
@@ -86,13 +89,13 @@ def run_row(rig: Rig, row: Row, times: int, rng: random.Random, host: HostStall)
     repeated = 0
     for index in range(times):
         sample = attempt(rig, row, rng, host)
-        tell(row, f"{index + 1}/{times}", sample)
+        _show(row, f"{index + 1}/{times}", sample)
         if sample.hindered:
             repeated += 1
             if row.judged_by is not Judge.UNCHANGED:
-                samples.append(sample)  # it stopped as it should
+                samples.append(sample)  # the robot stopped as required
             sample = attempt(rig, row, rng, host)
-            tell(row, f"{index + 1}/{times} again", sample)
+            _show(row, f"{index + 1}/{times} again", sample)
             sample.wrong += sample.hindered
         samples.append(sample)
     return RowResult(row, samples, repeated)
@@ -104,31 +107,24 @@ def attempt(rig: Rig, row: Row, rng: random.Random, host: HostStall) -> Sample:
     try:
         sample = injection(rig, row, rng, host)
     except (FaultError, StepError) as error:
-        # A fault that did not strike or a runner that did not drive fails this injection, not those after it.
+        # A fault without effect or a runner that did not drive fails this injection only.
         sample = Sample(None, 0.0, [str(error).splitlines()[0]])
         rig.kill_runner()
-        rig.clear()  # raises when the robot's side has gone: that is the end
+        rig.clear()  # raises if edge-hil has ended, which ends everything
     time.sleep(max(0.0, row.spacing_s - (time.monotonic_ns() - begun_ns) / 1e9))
     return sample
 
 
-def tell(row: Row, which: str, sample: Sample) -> None:
-    """Progress of one injection."""
-    shown = "never" if sample.latency_ms is None else f"{sample.latency_ms:.0f} ms"
+def _show(row: Row, which: str, sample: Sample) -> None:
+    latency = "never" if sample.latency_ms is None else f"{sample.latency_ms:.0f} ms"
     wrong = "; ".join(sample.wrong + sample.hindered)
-    say(f"{row.name} {which}: {shown} of {row.bound_ms:.0f} ms{wrong and f' ({wrong})'}")
-
-
-def say(line: str) -> None:
-    """Progress."""
-    sys.stderr.write(f"faults: {line}\n")
-    sys.stderr.flush()
+    _print(f"{row.name} {which}: {latency} of {row.bound_ms:.0f} ms{wrong and f' ({wrong})'}")
 
 
 def run(args: argparse.Namespace, wanted: Sequence[Row]) -> list[RowResult]:
-    """Everything; what was measured until an interrupt or a failure of the rig is kept and shown.
+    """Inject into all rows; results until an interrupt or a failure of the rig stay in `faults.json`.
 
-    Raises StepError where no runner would be armed, FaultError when the robot's side does not answer.
+    Raises StepError if no flight could be recorded, FaultError if edge-hil does not answer.
     """
     results: list[RowResult] = []
     domain = free_domain() if args.domain is None else args.domain
@@ -139,8 +135,8 @@ def run(args: argparse.Namespace, wanted: Sequence[Row]) -> list[RowResult]:
             raise StepError(f"{folder}: {refusal}")
         stack.callback(keep_logs, folder, args.out)
         host = stack.enter_context(HostStall())
-        rig = stack.enter_context(Rig(folder, args.artifacts.absolute(), domain, say))
-        say(f"starting the robot's side in domain {domain}")
+        rig = stack.enter_context(Rig(folder, args.artifacts.absolute(), domain, _print))
+        _print(f"starting the robot's side in domain {domain}")
         rig.start()
         rng = random.Random(args.seed)
         for row in wanted:
@@ -173,7 +169,7 @@ def main(argv: list[str] | None = None) -> int:
             raise ValueError(f"--artifacts {args.artifacts}: expected a directory made by edge-export")
         args.out.mkdir(parents=True, exist_ok=True)
     except (ValueError, OSError) as error:
-        say(str(error))
+        _print(str(error))
         return EXIT_BAD_INPUT
     if args.list:
         for row in wanted:
@@ -183,10 +179,10 @@ def main(argv: list[str] | None = None) -> int:
     try:
         results = run(args, wanted)
     except KeyboardInterrupt:
-        say(f"interrupted, all processes ended; what was measured is in {args.out}")
+        _print(f"interrupted, all processes ended; what was measured is in {args.out}")
         return EXIT_INTERRUPTED
     except (StepError, FaultError, OSError) as error:
-        say(str(error))
+        _print(str(error))
         return EXIT_CHECK_FAILED
     summary = result(results, machine_facts())
     write_result(args.json, summary)

@@ -26,7 +26,7 @@ _SLOW_DOWN = 1.2  # full speed as long as the heading is within 34 degrees
 def steering(T_odom_base: SE2) -> tuple[float, float]:
     """Speed (m/s) and yaw rate (rad/s) that lead onto the circle, counter-clockwise, from anywhere.
 
-    A robot that looks the wrong way turns nearly on the spot: it must not leave the small place.
+    A robot with the wrong heading turns nearly on the spot, so that it stays within the small place.
     """
     radius_m = math.hypot(T_odom_base.x_m, T_odom_base.y_m)
     tangent_rad = math.atan2(T_odom_base.y_m, T_odom_base.x_m) + math.pi / 2

@@ -104,14 +104,12 @@ class Faults:
         signature = inspect.signature(original)
 
         def act(*args: Any, **kwargs: Any) -> Any:
-            if self._on("control-death") is not None:
-                raise UnexpectedError("injected: the control thread dies")
+            self._fail("control-death", UnexpectedError("injected: the control thread dies"))
             for fault, default in (("control-hang", 3600.0), ("tick-slow", 0.3)):
                 values = self._on(fault)
                 if values is not None:
                     time.sleep(_seconds(values, default))
-            if self._on("act-error") is not None:
-                raise GraphError("injected: the action expert's graph fails")
+            self._fail("act-error", GraphError("injected: the action expert's graph fails"))
             real = original(*args, **kwargs)
             given = signature.bind(*args, **kwargs).arguments
             pose: SE2 = given["semantic"].T_odom_anchor @ given["offset"]
@@ -140,20 +138,21 @@ class Faults:
 
     def _encode(self, original: Callable[..., Any]) -> Callable[..., Any]:
         def encode(*args: Any, **kwargs: Any) -> Any:
-            if self._on("encoder-error") is not None:
-                raise GraphError("injected: the encoder's graph fails")
+            self._fail("encoder-error", GraphError("injected: the encoder's graph fails"))
             return original(*args, **kwargs)
 
         return encode
 
+    def _fail(self, fault: str, error: Exception) -> None:
+        if self._on(fault) is not None:
+            raise error
+
     def _language(self, original: Callable[..., Any]) -> Callable[..., Any]:
         def run(*args: Any, **kwargs: Any) -> Any:
-            if self._on("reasoning-death") is not None:
-                raise UnexpectedError("injected: the reasoning thread dies")
+            self._fail("reasoning-death", UnexpectedError("injected: the reasoning thread dies"))
             while self._on("reasoning-hang") is not None:
                 time.sleep(_HANG_POLL_S)
-            if self._on("reasoning-error") is not None:
-                raise GraphError("injected: the language model's graph fails")
+            self._fail("reasoning-error", GraphError("injected: the language model's graph fails"))
             return original(*args, **kwargs)
 
         return run
@@ -168,8 +167,7 @@ class Faults:
 
     def _disk(self, original: Callable[..., Any]) -> Callable[..., Any]:
         def touch(*args: Any, **kwargs: Any) -> Any:
-            if self._on("disk-full") is not None:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            self._fail("disk-full", OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
             values = self._on("disk-stall")
             if values is not None:
                 time.sleep(_seconds(values, 5.0))

@@ -1,11 +1,11 @@
-"""One injection: drive, inject, listen, judge, make it good again."""
+"""One injection: drive, inject, listen, judge, restore."""
 
 from __future__ import annotations
 
 import random
 import signal
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 
 from tools.faults.host_stall import HostStall
 from tools.faults.received import ReceivedCommand, first_lasting, longest_gap_ms, moves
@@ -13,13 +13,13 @@ from tools.faults.rig import Rig
 from tools.faults.rows import Judge, Row
 
 PHASE_S = 0.1
-"""An injection falls anywhere in a tick."""
+"""Injections are spread over this time: one tick."""
 HOLD_S = 0.4
-"""A zero has lasted when nothing but zero came for so long."""
+"""A stop counts as lasting after this time with zero commands only."""
 WATCH_S = 2.0
-"""How long nothing may change."""
+"""Duration of the watch for rows that must change nothing."""
 STAY_S = 0.5
-"""How long a latched stop is watched after its fault has gone."""
+"""Duration of the watch of a latched stop after the end of its fault."""
 RESUME_S = 15.0
 LIMIT_TOLERANCE = 1.02
 _RECENT_NS = 1_000_000_000
@@ -30,91 +30,89 @@ _ANY = float("inf")
 
 @dataclass
 class Sample:
-    """One injection's figure; None: what had to come did not come in time."""
+    """Result of one injection; `latency_ms` is None if the expected reaction did not come in time."""
 
     latency_ms: float | None
     stall_ms: float
-    """For how much of that time the machine itself stood still."""
+    """Part of that time in which the machine itself stood still."""
     wrong: list[str] = field(default_factory=list)
-    """What else was not right."""
+    """Other failures."""
     hindered: list[str] = field(default_factory=list)
-    """The robot did not drive where it may: on a busy machine not only the fault can do that, so it is tried again."""
-
-    def as_json(self) -> dict[str, object]:
-        """For the result."""
-        return asdict(self)
+    """Why the robot did not drive where it may. A busy machine can cause that too, so the injection is repeated."""
 
 
 def injection(rig: Rig, row: Row, rng: random.Random, host: HostStall) -> Sample:
-    """Do one. Raises StepError or FaultError when the rig itself does not work."""
+    """Make one injection. Raises StepError or FaultError when the rig itself does not work."""
     rig.ensure_moving()
     time.sleep(rng.uniform(0.0, PHASE_S))
     before_ns = time.monotonic_ns()
-    strangers = rig.hearing.sources() - {one.source for one in rig.hearing.since(before_ns - _RECENT_NS)}
-    known = rig.hearing.sources() - strangers
+    new = rig.received.sources() - {one.source for one in rig.received.since(before_ns - _RECENT_NS)}
+    commanders = rig.received.sources() - new
     effect_ns = row.inject(rig)
     if row.judged_by is Judge.UNCHANGED:
         sample = _unchanged(rig, effect_ns, host)
     else:
-        sample = _awaited(rig, row, effect_ns, known, host)
-    _aftermath(rig, row, sample, known)
+        sample = _awaited(rig, row, effect_ns, commanders, host)
+    _aftermath(rig, row, sample, commanders)
     return sample
 
 
-def _awaited(rig: Rig, row: Row, effect_ns: int, known: frozenset[int], host: HostStall) -> Sample:
-    """Wait for what has to come and to last, at most twice the bound and a second more."""
+def _awaited(rig: Rig, row: Row, effect_ns: int, commanders: frozenset[int], host: HostStall) -> Sample:
+    """Wait for the lasting reaction, for at most twice the bound and a second more."""
     end_ns = effect_ns + round((2 * row.bound_ms + 1000 + 1000 * HOLD_S) * 1e6)
     first: int | None = None
     while time.monotonic_ns() < end_ns:
-        first = _first(rig, row, effect_ns, known)
+        first = _first(rig, row, effect_ns, commanders)
         if first is not None and time.monotonic_ns() - first > HOLD_S * 1e9:
             break
         time.sleep(_POLL_S)
     if first is None:
         return Sample(None, host.between_ns(effect_ns, end_ns) / 1e6)
-    # The very command under way when the fault struck may already be what was to come.
+    # A command on its way when the fault took effect may already be the expected one.
     sample = Sample(max(first - effect_ns, 0) / 1e6, host.between_ns(effect_ns, first) / 1e6)
-    if row.judged_by is Judge.LIMIT and not (rig.drives_on(RESUME_S) and _first(rig, row, first, known) is not None):
+    if row.judged_by is Judge.LIMIT and not (
+        rig.drives_on(RESUME_S) and _first(rig, row, first, commanders) is not None
+    ):
         sample.hindered.append("stopped, not limited")
     return sample
 
 
-def _first(rig: Rig, row: Row, effect_ns: int, known: frozenset[int]) -> int | None:
+def _first(rig: Rig, row: Row, effect_ns: int, commanders: frozenset[int]) -> int | None:
     if row.judged_by is Judge.ROBOT:
         changes = [change for change in rig.robot_obeys_motion() if change[0] >= effect_ns]
         return changes[-1][0] if changes and not changes[-1][1] else None
-    heard = moves(one for one in rig.hearing.since(effect_ns) if one.source in known)
+    received = moves(one for one in rig.received.since(effect_ns) if one.source in commanders)
     if row.judged_by is Judge.LIMIT:
         limits, scale = rig.config.limits, row.speed_scale * LIMIT_TOLERANCE
-        return first_lasting(heard, (limits.vx_max_mps * scale, _ANY, _ANY))
-    return first_lasting(heard, _ZERO)
+        return first_lasting(received, (limits.vx_max_mps * scale, _ANY, _ANY))
+    return first_lasting(received, _ZERO)
 
 
 def _unchanged(rig: Rig, effect_ns: int, host: HostStall) -> Sample:
-    """Nothing may change: the commands go on, none is zero or slowed down."""
+    """Watch that the commands continue and that none is zero or slower."""
     before_mps = rig.speed_mps()
     time.sleep(max(0.0, WATCH_S - (time.monotonic_ns() - effect_ns) / 1e9))
     end_ns = effect_ns + round(WATCH_S * 1e9)
-    heard: list[ReceivedCommand] = rig.hearing.since(effect_ns)
-    moving = moves(one for one in heard if one.moving)
+    received: list[ReceivedCommand] = rig.received.since(effect_ns)
+    moving = moves(one for one in received if one.moving)
     sample = Sample(longest_gap_ms(moving, effect_ns, end_ns), host.between_ns(effect_ns, end_ns) / 1e6)
-    if any(not one.moving for one in heard if one.velocity is not None):
+    if any(not one.moving for one in received if one.velocity is not None):
         sample.hindered.append("a zero was sent")
     if min((velocity[0] for _, velocity in moving), default=0.0) < 0.8 * before_mps:
         sample.hindered.append("the speed fell")
     return sample
 
 
-def _aftermath(rig: Rig, row: Row, sample: Sample, known: frozenset[int]) -> None:
-    """Make it good again and see that the robot does what it should then."""
+def _aftermath(rig: Rig, row: Row, sample: Sample, commanders: frozenset[int]) -> None:
+    """End the fault and check how the robot goes on."""
     if row.thaw:
         rig.send(rig.runner, signal.SIGCONT)
-        _stays(rig, sample, known, "moved after SIGCONT")
+        _stays(rig, sample, commanders, "moved after SIGCONT")
     if row.undo is not None:
         row.undo(rig)
     if row.latches:
         if row.judged_by is not Judge.UNCHANGED and not row.thaw:
-            _stays(rig, sample, known, "moved although the stop latches")
+            _stays(rig, sample, commanders, "moved although the stop latches")
         rig.kill_runner()
         if row.kills_bridge:
             rig.kill_bridge()
@@ -127,9 +125,9 @@ def _aftermath(rig: Rig, row: Row, sample: Sample, known: frozenset[int]) -> Non
         rig.clear()
 
 
-def _stays(rig: Rig, sample: Sample, known: frozenset[int], otherwise: str) -> None:
-    """A latched stop stays one when its fault has gone; a runner that has ended cannot show it."""
+def _stays(rig: Rig, sample: Sample, commanders: frozenset[int], otherwise: str) -> None:
+    """Check that a latched stop remains when its fault has ended."""
     since_ns = time.monotonic_ns()
     time.sleep(STAY_S)
-    if any(one.moving and one.source in known for one in rig.hearing.since(since_ns)):
+    if any(one.moving and one.source in commanders for one in rig.received.since(since_ns)):
         sample.wrong.append(otherwise)

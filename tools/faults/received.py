@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import itertools
-import json
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from firmware_bridge.unitree.messages import ids
+from sim_hil.realtime.truth import LineTail
 
 Velocity = tuple[float, float, float]
 KEEP_NS = 120_000_000_000
@@ -31,31 +30,11 @@ class ReceivedCommand:
         return self.velocity is not None and any(self.velocity)
 
 
-class Tail:
-    """Reads each line of a growing file of JSON lines once; an unfinished last line is read later."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._offset = 0
-
-    def lines(self) -> list[dict[str, Any]]:
-        """Lines added since the last call; none while there is no file."""
-        try:
-            with self._path.open("rb") as file:
-                file.seek(self._offset)
-                data = file.read()
-        except FileNotFoundError:
-            return []
-        whole = data[: data.rfind(b"\n") + 1]
-        self._offset += len(whole)
-        return [json.loads(line) for line in whole.splitlines()]
-
-
-class Hearing:
+class ReceivedCommands:
     """The requests that the sniffer has received in the last two minutes."""
 
     def __init__(self, path: Path) -> None:
-        self._tail = Tail(path)
+        self._tail = LineTail(path)
         self._requests: deque[ReceivedCommand] = deque()
 
     def update(self) -> None:
@@ -69,10 +48,10 @@ class Hearing:
         while self._requests and self._requests[-1].t_ns - self._requests[0].t_ns > KEEP_NS:
             self._requests.popleft()
 
-    def since(self, t_ns: int, *, but: frozenset[int] = frozenset()) -> list[ReceivedCommand]:
-        """Requests from `t_ns` on, without those of the sources in `but`."""
+    def since(self, t_ns: int) -> list[ReceivedCommand]:
+        """Requests from `t_ns` on."""
         self.update()
-        return [request for request in self._requests if request.t_ns >= t_ns and request.source not in but]
+        return [request for request in self._requests if request.t_ns >= t_ns]
 
     def sources(self) -> frozenset[int]:
         """Sources of the requests of the last two minutes."""

@@ -1,9 +1,9 @@
-"""What the injections have shown: per row n, p50, p99.9, max, bound and verdict."""
+"""Results of the injections: per row n, p50, p99.9, max, bound and verdict."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -23,11 +23,11 @@ _WHAT = {
 
 @dataclass(frozen=True)
 class RowResult:
-    """One row's samples and what they are worth.
+    """One row's samples and their verdict.
 
     A bound holds when the 99.9th percentile is within it, no sample is above twice it, every sample came at all and
-    nothing else was wrong. A sample during which the machine itself stood still is granted that time, and counted; so
-    is an injection that was `repeated` because the robot did not drive where it may, and did so the second time.
+    nothing else was wrong. The time in which the machine itself stood still is granted and counted, as is an injection
+    that was `repeated` because the robot did not drive where it may.
     """
 
     row: Row
@@ -36,23 +36,23 @@ class RowResult:
 
     @property
     def latencies_ms(self) -> list[float]:
-        """As measured, what never came left out."""
+        """Measured latencies, ms."""
         return [sample.latency_ms for sample in self.samples if sample.latency_ms is not None]
 
     @property
     def granted(self) -> int:
-        """Samples that are above the bound by no more than the machine stood still."""
+        """Number of samples above the bound by no more than the machine stood still."""
         bound = self.row.bound_ms
         return sum(1 for s in self.samples if s.latency_ms is not None and bound < s.latency_ms <= bound + s.stall_ms)
 
     @property
     def problems(self) -> list[str]:
-        """Why the row has failed; empty: it has passed."""
+        """Reasons why the row has failed; empty if it has passed."""
         if not self.samples:
             return ["no injection"]
         bound = self.row.bound_ms
-        found = [f"{sum(s.latency_ms is None for s in self.samples)} never came"]
-        found = [] if found[0].startswith("0 ") else found
+        missing = sum(s.latency_ms is None for s in self.samples)
+        found = [f"{missing} never came"] if missing else []
         judged = [s.latency_ms - s.stall_ms if s.latency_ms > bound else s.latency_ms
                   for s in self.samples if s.latency_ms is not None]  # fmt: skip
         if judged and percentile(judged, 99.9) > bound:
@@ -76,12 +76,12 @@ class RowResult:
             "repeated": self.repeated,
             "problems": self.problems,
             "pass": not self.problems,
-            "samples": [sample.as_json() for sample in self.samples],
+            "samples": [asdict(sample) for sample in self.samples],
         }
 
 
 def percentile(values: Sequence[float], share: float) -> float:
-    """Percentile of at least one value, no interpolation upwards of what was seen."""
+    """Return a percentile of at least one value; never more than the largest one."""
     return float(np.percentile(np.array(values), share, method="higher"))
 
 
@@ -97,8 +97,8 @@ def result(rows: Sequence[RowResult], machine: Mapping[str, object]) -> dict[str
 
 
 def show(rows: Sequence[RowResult], console: Console) -> None:
-    """Print the table: times in ms from the fault's effect to what is named, as the sniffer heard it."""
-    table = Table(title="Faults: from effect to what is judged, ms, heard on the robot's side", title_justify="left")
+    """Print the table: times in ms from the fault's effect to the judged event, as the sniffer received it."""
+    table = Table(title="Faults: from effect to what is judged, ms, received on the robot's side", title_justify="left")
     table.add_column("injected")
     table.add_column("fault of the table")
     table.add_column("judged")

@@ -14,12 +14,13 @@ from pathlib import Path
 
 from firmware_bridge.core.config import RobotConfig, load_robot_config
 from sim_hil.processes.child_process import last_lines
-from sim_hil.protocols.fault_client import FaultClient, FaultError
+from sim_hil.protocols.fault_socket import FaultClient, FaultError
 from sim_hil.realtime.children import Child, Children, StepError
 from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_FILE
+from sim_hil.realtime.truth import LineTail
 from tools.demo import INSTRUCTION
 from tools.faults.circle import SPEED_MPS
-from tools.faults.received import Hearing, Tail
+from tools.faults.received import ReceivedCommands
 
 READY_TIMEOUT_S = 90.0
 MOVING_TIMEOUT_S = 60.0
@@ -35,24 +36,23 @@ def _has_printed(child: Child, text: str) -> bool:
 
 
 class Rig:
-    """One domain's worth of processes; a context manager that ends exactly those it started."""
+    """The processes of one DDS domain; a context manager that ends exactly those it started."""
 
     def __init__(
         self, folder: Path, artifacts: Path, domain: int, say: Callable[[str], None], *, record: bool = True
     ) -> None:
-        """`folder` takes sockets and logs; a short path, since a socket's may have 107 bytes. `record`: flights too."""
+        """Put sockets and logs into `folder`, whose path must be short: a socket's has at most 107 bytes."""
         self.folder = folder
         self.domain = domain
-        self.hearing = Hearing(folder / "heard.jsonl")
+        self.received = ReceivedCommands(folder / "received.jsonl")
         self.config: RobotConfig = load_robot_config(ROBOT_FILE, socket=folder / "b.sock", domain=domain)
-        self.runner_starts = 0
         self.jump_m = 1.0
         self.needs_operator = False
         self._artifacts = artifacts
         self._record = record
         self._say = say
         self._children = Children(folder, grace_s=5.0)
-        self._trace = Tail(folder / "trace.jsonl")
+        self._trace = LineTail(folder / "trace.jsonl")
         self._commanded: list[tuple[int, bool]] = []
         self._runs = 0
         self._rogues: list[Child] = []
@@ -76,7 +76,7 @@ class Rig:
 
     @property
     def inside(self) -> FaultClient:
-        """Where the faults inside the runner are asked for."""
+        """Client of the faults inside the runner."""
         assert self._inside is not None
         return self._inside
 
@@ -87,8 +87,8 @@ class Rig:
         faults = ["--faults", str(self.folder / "hil.faults")]
         sniffer = [sys.executable, "-m", "tools.faults.sniffer", "--domain", str(self.domain)]
         self.hil = self._children.start("edge-hil", [*COMMANDS["edge-hil"], *scene, *where, *faults])
-        heard = self._children.start("sniffer", [*sniffer, "--out", str(self.folder / "heard.jsonl")])
-        for child, line in ((heard, "sniffer: ready"), (self.hil, READY_LINE)):
+        sniffing = self._children.start("sniffer", [*sniffer, "--out", str(self.folder / "received.jsonl")])
+        for child, line in ((sniffing, "sniffer: ready"), (self.hil, READY_LINE)):
             self._wait(partial(_has_printed, child, line), READY_TIMEOUT_S, child, line)
 
     def start_bridge(self) -> None:
@@ -101,7 +101,6 @@ class Rig:
         if self._inside is not None:
             self._inside.close()
         self._runs += 1
-        self.runner_starts += 1
         socket = self.folder / f"r{self._runs}.faults"
         command = [sys.executable, "-m", "tools.faults.faulty_runner", str(socket), *self._link()]
         command += ["--artifacts", str(self._artifacts), "--instruction", INSTRUCTION]
@@ -111,7 +110,7 @@ class Rig:
         self._inside = FaultClient(socket, self.folder / f"i{self._runs}")
 
     def ensure_moving(self) -> None:
-        """Have the robot driven, steadily and at full speed; starts what is not running. Raises StepError."""
+        """Start what is not running and wait until the robot is driven at full speed. Raises StepError."""
         for _ in range(_ATTEMPTS):
             if self.bridge is None or not self.bridge.running:
                 self.kill_runner()
@@ -130,15 +129,15 @@ class Rig:
             self._wait(partial(self._moving_or_ended, runner), MOVING_TIMEOUT_S, runner, "motion")
             if runner.running:
                 return
-            self._say(f"the runner ended before it was asked to: {last_words(runner)}")
-        raise StepError(f"the runner ended {_ATTEMPTS} times before it was asked to: {last_words(runner)}")
+            self._say(f"the runner ended before it was asked to: {last_line(runner)}")
+        raise StepError(f"the runner ended {_ATTEMPTS} times before it was asked to: {last_line(runner)}")
 
     def _moving_or_ended(self, runner: Child) -> bool:
         return self.moving() or not runner.running
 
     def moving(self) -> bool:
         """Whether the newest commands are all near full speed, and fresh."""
-        last = self.hearing.last_moves(_STEADY_MOVES)
+        last = self.received.last_moves(_STEADY_MOVES)
         fresh = bool(last) and time.monotonic_ns() - last[-1].t_ns < 200_000_000
         fast = [one.velocity is not None and one.velocity[0] >= _STEADY_SHARE * SPEED_MPS for one in last]
         return fresh and len(last) == _STEADY_MOVES and all(fast)
@@ -146,7 +145,7 @@ class Rig:
     def drives_on(self, timeout_s: float) -> bool:
         """Wait for motion at any speed without starting anything; False when it did not come."""
         deadline_ns = time.monotonic_ns() + round(timeout_s * 1e9)
-        while not all(one.moving for one in self.hearing.last_moves(_STEADY_MOVES)):
+        while not all(one.moving for one in self.received.last_moves(_STEADY_MOVES)):
             gone = self.runner is None or not self.runner.running
             if gone or time.monotonic_ns() > deadline_ns:
                 return False
@@ -155,7 +154,7 @@ class Rig:
 
     def speed_mps(self) -> float:
         """Median forward speed commanded lately."""
-        return statistics.median(abs(one.velocity[0]) for one in self.hearing.last_moves(25) if one.velocity)
+        return statistics.median(abs(one.velocity[0]) for one in self.received.last_moves(25) if one.velocity)
 
     def send(self, child: Child | None, number: signal.Signals) -> int:
         """Send a signal; returns when, monotonic ns."""
@@ -181,14 +180,7 @@ class Rig:
 
     def _operator_arms(self) -> None:
         """Permit the waiting runner to arm, as an operator does it. Raises StepError."""
-        command = [
-            *COMMANDS["edge-bridge"],
-            "arm",
-            "--robot",
-            str(ROBOT_FILE),
-            "--socket",
-            str(self.config.bridge.socket),
-        ]
+        command = [*COMMANDS["edge-bridge"], "arm", "--robot", str(ROBOT_FILE), "--socket", str(self.folder / "b.sock")]
         done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
         if done.returncode != 0:
             raise StepError(f"edge-bridge arm: exit code {done.returncode}: {done.stderr.strip()}")
@@ -214,7 +206,7 @@ class Rig:
             self._rogues.append(rogue)
 
     def wait_alone(self) -> None:
-        """Wait until no second commander has been heard for as long as the bridge remembers one."""
+        """Wait until the bridge has forgotten every second commander."""
         for rogue in self._rogues:
             rogue.process.wait(30.0)
         time.sleep(_COMMANDER_S)
@@ -229,7 +221,7 @@ class Rig:
         return self._commanded
 
     def clear(self) -> None:
-        """Switch every fault off, on both sides, as far as somebody is there to hear it."""
+        """Switch every fault off, in edge-hil and in the runner if it still runs."""
         self.robot.inject("clear")
         if self._inside is not None and self.runner is not None and self.runner.running:
             with suppress(FaultError):
@@ -260,7 +252,7 @@ def _asks_or_ended(runner: Child) -> bool:
     return "waiting for `edge-bridge arm`" in runner.log.read_text() or not runner.running
 
 
-def last_words(child: Child) -> str:
-    """The last thing that a process has said in words, its result left out."""
-    said = [line for line in last_lines(child.log, 4) if "{" not in line]
-    return said[-1] if said else f"nothing, exit code {child.process.returncode}"
+def last_line(child: Child) -> str:
+    """Return the last line of a process's log that is not JSON."""
+    lines = [line for line in last_lines(child.log, 4) if "{" not in line]
+    return lines[-1] if lines else f"nothing, exit code {child.process.returncode}"

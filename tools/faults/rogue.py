@@ -18,19 +18,18 @@ from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.rpc import RpcClient, move_parameter
 
 _FIND_TIMEOUT_S = 10.0
+_SPEED_MPS = 0.2
+_RATE_HZ = 10.0
 
 
 def main(argv: list[str] | None = None) -> int:
     """Send, then end."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--domain", type=int, required=True)
-    parser.add_argument("--interface", default="lo")
-    parser.add_argument("--vx", type=float, default=0.2, help="m/s (default: 0.2)")
-    parser.add_argument("--rate", type=float, default=10.0, help="Hz (default: 10)")
     parser.add_argument("--duration", type=float, default=1.0, help="s (default: 1)")
     args = parser.parse_args(argv)
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR1})  # DDS's threads inherit it: only sigwait takes it
-    bus = Bus(DdsConfig(args.domain, args.interface, ("127.0.0.1",) if args.interface == "lo" else ()))
+    bus = Bus(DdsConfig(args.domain, "lo", ("127.0.0.1",)))
     sport = RpcClient(bus, ids.SPORT_SERVICE)
     deadline_ns = time.monotonic_ns() + round(_FIND_TIMEOUT_S * 1e9)
     while not sport.connected():
@@ -41,9 +40,9 @@ def main(argv: list[str] | None = None) -> int:
     print("rogue: ready", flush=True)
     signal.sigwait({signal.SIGUSR1})
     print(f"rogue: first {time.monotonic_ns()}", flush=True)
-    for _ in range(max(1, round(args.duration * args.rate))):
-        sport.send(ids.MOVE, move_parameter(args.vx, 0.0, 0.0), noreply=True)
-        time.sleep(1.0 / args.rate)
+    for _ in range(max(1, round(args.duration * _RATE_HZ))):
+        sport.send(ids.MOVE, move_parameter(_SPEED_MPS, 0.0, 0.0), noreply=True)
+        time.sleep(1.0 / _RATE_HZ)
     bus.close()
     return 0
 

@@ -1,4 +1,4 @@
-"""What `make faults` injects: each row names its fault of the table, how it is made, and what must come of it."""
+"""Rows of `make faults`: the fault of the table, how it is injected, and the required reaction."""
 
 from __future__ import annotations
 
@@ -8,24 +8,23 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
 from types import MappingProxyType
-from typing import Any
 
 from edge.safety.faults.table import FAULTS, Action
-from sim_hil.protocols.fault_client import TIMEOUT_S
+from sim_hil.protocols.fault_socket import TIMEOUT_S
 from tools.faults.rig import Rig
 
 BRIDGE_STOP_MS = 300
-"""A bridge that is told to end, or whose runner is, stops the robot as soon as after a dead runner."""
+"""Bound on the stop after SIGTERM to the bridge or the runner, ms: as after a dead runner."""
 
 SCENE_MS = 1000
 """A scene that stays the same is found by distance: 0.25 m or 12° take 0.4 s on the circle, more where it slows."""
 
 
 class Judge(Enum):
-    """What a row is judged by."""
+    """Quantity by which a row is judged."""
 
     ZERO = "zero"
-    """Time to the zero velocity that lasts."""
+    """Time to the lasting zero velocity."""
     LIMIT = "limit"
     """Time to commands that stay within the limit's share of the speed limit."""
     ROBOT = "robot"
@@ -125,7 +124,7 @@ NOT_INJECTED: Mapping[str, str] = MappingProxyType(
         "latch-lost": "the robot rests already; process tests kill the bridge after a stop",
         "state-from-future": "process test with a second participant that forges reports",
         "lease-taken": "to the robot the same as a second commander, which is injected; process test",
-        "stop-denied": "the robot does not obey: process test of what the operator is told",
+        "stop-denied": "the robot does not obey: process test of the message to the operator",
         "second-publisher": "process test with a second robot in the same domain",
         "motor-commands": "process test with a second participant",
         "emergency-stop-latched": "the robot is not driven; model test and process tests",
@@ -152,9 +151,9 @@ def _robot(name: str, fault: str, injected: str, **values: float | str) -> Row:
 
 
 def _harmless(name: str, injected: str, **values: float | str) -> Row:
-    """Something of the robot's side that must change nothing."""
+    """A fault of the robot's side that must change nothing."""
     row = _robot(name, "message-reordered", injected, **values)
-    return _with(row, fault=None, judge=Judge.UNCHANGED, share=0.4)
+    return replace(row, fault=None, judge=Judge.UNCHANGED, share=0.4)
 
 
 def _clear(rig: Rig) -> None:
@@ -169,12 +168,8 @@ def _inside(name: str, fault: str, injected: str, **values: float | str) -> Row:
     return Row(name, fault, lambda rig: rig.inside.inject(injected, on=True, timeout_s=_INSIDE_S, **values), _clear)
 
 
-def _with(row: Row, **changes: Any) -> Row:
-    return replace(row, **changes)
-
-
 def _jump(rig: Rig) -> int:
-    """There, and back the next time: the circle must not wander into a wall."""
+    """Jump forward, and back the next time: the circle must not move into a wall."""
     effect_ns = rig.robot.inject("odometry-jump", dx_m=rig.jump_m)
     rig.jump_m = -rig.jump_m
     return effect_ns
@@ -189,7 +184,7 @@ def _two_jumps(rig: Rig) -> int:
 
 def _wall_clock(seconds_s: float) -> Callable[[Rig], int]:
     def inject(rig: Rig) -> int:
-        # Nobody may ever ask for the date, so there is no effect to wait for.
+        # No code may read the date, so there is no effect to wait for.
         rig.inside.ask("wall-clock", seconds_s=seconds_s)
         return time.monotonic_ns()
 
@@ -215,22 +210,22 @@ def _dead_link(rig: Rig) -> int:
 
 
 def rows() -> tuple[Row, ...]:
-    """All of them; those that leave the run alive come first, so that one run serves many."""
+    """Return all rows; those that leave the run alive come first, so that they share a run."""
     live = (
         _robot("camera stops", "camera-stopped", "camera-stop"),
         _robot("camera freezes", "camera-frozen", "camera-freeze"),
         _robot("camera repeats two pictures in turn", "camera-frozen", "camera-stale-buffers"),
-        _with(_robot("clock in a frozen picture", "camera-frozen", "camera-frozen-clock"), bound=SCENE_MS),
-        _with(_robot("noise on a frozen picture", "camera-frozen", "camera-frozen-noise"), bound=SCENE_MS),
+        replace(_robot("clock in a frozen picture", "camera-frozen", "camera-frozen-clock"), bound=SCENE_MS),
+        replace(_robot("noise on a frozen picture", "camera-frozen", "camera-frozen-noise"), bound=SCENE_MS),
         _robot("camera answers 1 s late", "camera-stale", "camera-slow", delay_s=1.0),
         _robot("camera at half rate", "camera-slow", "camera-half-rate", rate_hz=5.0),
         _robot("camera at a third of its rate", "camera-too-slow", "camera-half-rate", rate_hz=3.0),
         _robot("camera covered", "frames-refused", "camera-black"),
         _robot("camera blinded", "frames-refused", "camera-saturated"),
         _robot("camera pictures torn", "frames-refused", "camera-torn"),
-        _with(Row("odometry jumps 1 m once", "odometry-jump", _jump), spacing_s=12.5, share=0.4),
+        replace(Row("odometry jumps 1 m once", "odometry-jump", _jump), spacing_s=12.5, share=0.4),
         # Its end is a jump of the pose, and two of those within 10 s end the run.
-        _with(
+        replace(
             _robot("odometry freezes at zero speed", "odometry-frozen", "odometry-freeze", velocity="zero"),
             spacing_s=12.5, share=0.4,
         ),
@@ -244,49 +239,49 @@ def rows() -> tuple[Row, ...]:
         # Of two states that change places the older one is dropped: half of them are lost.
         _robot("states change places", "link-lossy", "state-reorder"),
         _harmless("states come twice", "state-duplicate"),
-        _with(_robot("battery at 15 %", "battery-low", "low-battery", soc_percent=15.0), share=0.4),
+        replace(_robot("battery at 15 %", "battery-low", "low-battery", soc_percent=15.0), share=0.4),
         _inside("plan is NaN", "output-not-finite", "nan-output"),
         _inside("action expert fails", "output-not-finite", "act-error"),
         _inside("plan never changes", "output-constant", "constant-output"),
         _inside("plan swings at every tick", "output-oscillating", "oscillating-output"),
         _inside("encoder fails", "camera-stopped", "encoder-error"),
         _inside("action expert takes 0.1 s more", "tick-late", "tick-slow", seconds_s=0.1),
-        _with(_inside("reasoning hangs", "semantic-expired", "reasoning-hang"), share=0.25),
-        _with(_inside("reasoning's third bad text", "semantic-text-invalid", "garbage-text", after=3.0), share=0.4),
-        _with(_inside("flight log's disk stalls", "log-disk-stalled", "disk-stall", seconds_s=3.0), share=0.4),
-        _with(Row("date jumps an hour ahead", "wall-clock-moved", _wall_clock(3600.0), _clear), share=0.4),
-        _with(Row("date jumps an hour back", "wall-clock-moved", _wall_clock(-3600.0), _clear), share=0.4),
+        replace(_inside("reasoning hangs", "semantic-expired", "reasoning-hang"), share=0.25),
+        replace(_inside("reasoning's third bad text", "semantic-text-invalid", "garbage-text", after=3.0), share=0.4),
+        replace(_inside("flight log's disk stalls", "log-disk-stalled", "disk-stall", seconds_s=3.0), share=0.4),
+        replace(Row("date jumps an hour ahead", "wall-clock-moved", _wall_clock(3600.0), _clear), share=0.4),
+        replace(Row("date jumps an hour back", "wall-clock-moved", _wall_clock(-3600.0), _clear), share=0.4),
     )  # fmt: skip
     over = (
         Row("runner SIGKILL", "runner-killed", lambda rig: rig.send(rig.runner, signal.SIGKILL)),
         Row("runner SIGSTOP, SIGCONT", "runner-frozen", lambda rig: rig.send(rig.runner, signal.SIGSTOP), thaw=True),
         Row("runner SIGTERM", None, lambda rig: rig.send(rig.runner, signal.SIGTERM), judge=Judge.ZERO, ends_run=True),
         _inside("control thread dies", "control-thread-dead", "control-death"),
-        _with(_inside("flight log's disk full", "log-disk-full", "disk-full"), ends_run=True, share=0.4),
+        replace(_inside("flight log's disk full", "log-disk-full", "disk-full"), ends_run=True, share=0.4),
         _inside("action expert takes 0.6 s", "commands-late", "tick-slow", seconds_s=0.6),
         _inside("graph does not come back", "graph-hung", "control-hang"),
-        _with(_inside("reasoning thread dies", "semantic-expired", "reasoning-death"), ends_run=True, share=0.5),
+        replace(_inside("reasoning thread dies", "semantic-expired", "reasoning-death"), ends_run=True, share=0.5),
         _inside("reasoning fails five times", "reasoning-failing", "reasoning-error", after=5.0),
         _inside("plan ten times too long", "output-out-of-range-often", "scaled-output"),
         _robot("camera has another size", "camera-swapped", "camera-wrong-size"),
-        _with(Row("odometry jumps 1 m twice", "odometry-jumps", _two_jumps), share=0.5),
+        replace(Row("odometry jumps 1 m twice", "odometry-jumps", _two_jumps), share=0.5),
         _robot("odometry freezes at full speed", "odometry-speed-mismatch", "odometry-freeze"),
         _robot("speed reads 1 m/s too high", "odometry-speed-mismatch", "odometry-bias"),
         _robot("robot tips over", "tipped-over", "tip-over"),
-        _with(_robot("battery at 3 %", "battery-empty", "low-battery", soc_percent=3.0), share=0.4),
+        replace(_robot("battery at 3 %", "battery-empty", "low-battery", soc_percent=3.0), share=0.4),
         _robot("robot reports an error", "robot-error", "error-code"),
         _robot("robot reports damping", "robot-mode-left", "wrong-mode", mode=7.0),
-        _with(_robot("remote: L2+B", "emergency-stop", "remote-keys"), operator_arms=True),
+        replace(_robot("remote: L2+B", "emergency-stop", "remote-keys"), operator_arms=True),
         _robot("remote: stick pushed", "emergency-stop", "remote-stick"),
         Row("second commander", "second-commander", lambda rig: rig.rogue(1.0), Rig.wait_alone),
         Row("late Move overtakes StopMove", "late-motion", _late_move),
-        _with(
+        replace(
             Row("StopMove unanswered for 10 s", "stop-call-blocked", _stop_unanswered, _clear),
             judge=Judge.ZERO, bound=BRIDGE_STOP_MS, ends_run=True, share=0.5,
         ),
-        _with(Row("link dead both ways", "link-lost", _dead_link, _clear), judge=Judge.ROBOT, share=0.5),
+        replace(Row("link dead both ways", "link-lost", _dead_link, _clear), judge=Judge.ROBOT, share=0.5),
         Row("bridge SIGTERM", None, lambda rig: rig.send(rig.bridge, signal.SIGTERM), judge=Judge.ZERO, ends_run=True),
         Row("bridge SIGKILL", "bridge-killed", lambda rig: rig.send(rig.bridge, signal.SIGKILL)),
-        _with(Row("bridge SIGSTOP", "bridge-hung", lambda rig: rig.send(rig.bridge, signal.SIGSTOP)), share=0.5),
+        replace(Row("bridge SIGSTOP", "bridge-hung", lambda rig: rig.send(rig.bridge, signal.SIGSTOP)), share=0.5),
     )  # fmt: skip
     return (*live, *over)

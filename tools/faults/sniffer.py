@@ -1,6 +1,6 @@
 """The judge: a process on the robot's side that stamps every request of the sport service as it arrives.
 
-    python -m tools.faults.sniffer --domain 7 --out heard.jsonl
+    python -m tools.faults.sniffer --domain 7 --out received.jsonl
 
 One JSON object a line: {"t_ns": monotonic, "source": writer's number, "api_id": 1008, "velocity": [x, y, wz] or null}.
 It shares no code path with what it judges but the DDS reader and the parser of a Move.
@@ -31,13 +31,12 @@ def main(argv: list[str] | None = None) -> int:
     """Listen until SIGTERM or SIGINT."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--domain", type=int, required=True)
-    parser.add_argument("--interface", default="lo")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.jsonl")
     args = parser.parse_args(argv)
     ended: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _frame: ended.append(number))
-    bus = Bus(DdsConfig(args.domain, args.interface, ("127.0.0.1",) if args.interface == "lo" else ()))
+    bus = Bus(DdsConfig(args.domain, "lo", ("127.0.0.1",)))
     reader = bus.reader(ids.request_topic(ids.SPORT_SERVICE), Request_, depth=_DEPTH, reliable=True)
     waitset = bus.waitset(reader)
     sources: dict[int, int] = {}

@@ -1,4 +1,4 @@
-"""Faults of a process of ours, switched from outside through a local socket; when they strike is told."""
+"""Faults of a process of ours, switched through a local socket, which answers with the time of the effect."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from typing import Any
 
 
 class Switches:
-    """What is on, with its parameters; a thread of its own listens at `path`, the same lines as `edge-hil --faults`.
+    """Active faults and their parameters; a thread listens at `path` for the same lines as `edge-hil --faults`.
 
-    The answer to switching a fault on comes when the code that makes it runs (`hit`) for the `after`-th time (default:
-    the first); off takes effect at once.
+    The answer to switching a fault on comes when its code runs (`hit`) for the `after`-th time (default: the first);
+    switching off takes effect at once.
     """
 
     def __init__(self, path: Path, names: Iterable[str]) -> None:
         self._names = frozenset(names)
         self._on: dict[str, dict[str, Any]] = {}
-        self._asked: dict[str, tuple[str, int]] = {}  # who waits, and for how many hits more
+        self._asked: dict[str, tuple[str, int]] = {}  # sender of the request, and number of hits until the answer
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.bind(str(path))
         threading.Thread(target=self._listen, name="fault-switches", daemon=True).start()
@@ -65,5 +65,5 @@ class Switches:
 
     def _answer(self, address: str, answer: dict[str, object]) -> None:
         if address:
-            with contextlib.suppress(OSError):  # whoever asked has gone
+            with contextlib.suppress(OSError):  # the sender has ended
                 self._socket.sendto(json.dumps(answer).encode(), address)

@@ -1,4 +1,4 @@
-"""Whether the paper's findings hold for our models: paired runs of the benchmark, differences, intervals, one page."""
+"""Test the paper's findings on our models: paired runs of the benchmark, differences, intervals, one page."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from edge.core.cli import (
     EXIT_REFUSED,
     check_result_target,
     command_line,
+    messages,
     stop_signals,
     write_result,
 )
-from reporting.build_progress import duration
+from reporting.progress import duration
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.conditions.latency import LatencyError, LatencyProfile, parse_latency
 from sim_hil.benchmark.language.instructions import is_held_out
 from sim_hil.benchmark.results.record import EpisodeResult, ResultError
 from sim_hil.benchmark.results.store import StoreError, read_results
-from sim_hil.benchmark.runs import RESULT, RunsError, read_result, run_episodes
+from sim_hil.benchmark.runs import RESULT, RunsError, choose, read_result, run_episodes
 from sim_hil.benchmark.suite.episode import Episode, SuiteError, load_suite
-from sim_hil.benchmark.workers.bench_run import choose
 from sim_hil.benchmark.workers.jobs import RefusedRunError
 from sim_hil.benchmark.workers.progress import BenchProgress
 from sim_hil.scene.scene import SceneError
@@ -53,6 +53,7 @@ it again to go on where it stopped.
 exit codes: 0 done (whatever holds), 1 an episode has no result, 2 bad arguments or input, 3 refused (artifacts),
             130 interrupted
 """
+_print = messages(COMMAND)
 _BAD_INPUT = (ConditionsError, LatencyError, SuiteError, SceneError, StoreError, ResultError, OSError)
 
 
@@ -87,20 +88,18 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
-@command_line("findings")
+@command_line(COMMAND, {ArtifactError: EXIT_REFUSED, **dict.fromkeys(_BAD_INPUT, EXIT_BAD_INPUT)})
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
     try:
         return _main(args)
-    except ArtifactError as error:
-        return _fail(EXIT_REFUSED, str(error))
     except RefusedRunError as error:
-        return _fail(error.code, str(error))
-    except _BAD_INPUT as error:
-        return _fail(EXIT_BAD_INPUT, str(error))
+        _print(str(error))
+        return error.code
     except KeyboardInterrupt:
-        return _fail(EXIT_INTERRUPTED, f"interrupted; run it again to go on, {args.out}/findings.md has what is there")
+        _print(f"interrupted; run it again to go on, {args.out}/findings.md has what is there")
+        return EXIT_INTERRUPTED
 
 
 def _main(args: argparse.Namespace) -> int:
@@ -116,7 +115,7 @@ def _main(args: argparse.Namespace) -> int:
         raise ConditionsError(next(iter(plan.missing.values()), "--rows: nothing to run"))
     if args.dry_run:
         for line in plan_lines(plan, len(episodes)):
-            _say(line)
+            _print(line)
         return EXIT_DONE
     args.out.mkdir(parents=True, exist_ok=True)
     broken: list[RunsError] = []
@@ -126,12 +125,12 @@ def _main(args: argparse.Namespace) -> int:
             for name in dict.fromkeys(plan.folders.values()):
                 try:
                     _run(args, name, plan.conditions[name], episodes, stop)
-                except RunsError as error:  # the other runs still tell
+                except RunsError as error:  # the other runs are still useful
                     broken.append(error)
-                    _say(str(error))
+                    _print(str(error))
                 except ConditionsError as error:  # not of this suite, or not by this model
                     unfit[name] = str(error)
-                    _say(f"{name}: {error}")
+                    _print(f"{name}: {error}")
     except KeyboardInterrupt:
         _report(args, plan, base, len(episodes), unfit)
         raise
@@ -142,10 +141,10 @@ def _main(args: argparse.Namespace) -> int:
             sys.stdout.write(
                 f"{each['verdict']:<14} {each['claim']}: {each['value']:+.1f} {each['ci95'] or ''} n {each['n']}\n"
             )
-    _say(f"{args.out / 'findings.md'}")
+    _print(f"{args.out / 'findings.md'}")
     if not result["findings"]:
-        return _fail(EXIT_CHECK_FAILED, "no claim could be judged: no run has a result")
-    return EXIT_CHECK_FAILED if broken else EXIT_DONE
+        _print("no claim could be judged: no run has a result")
+    return EXIT_CHECK_FAILED if broken or not result["findings"] else EXIT_DONE
 
 
 def rows_of(text: str | None) -> list[str]:
@@ -193,7 +192,7 @@ def _run(
 ) -> None:  # fmt: skip
     folder = args.out / "runs" / name
     done = len(read_results(folder)) if folder.is_dir() else 0
-    _say(f"{name}: {conditions.describe()}; {done} of {len(episodes)} episodes are there")
+    _print(f"{name}: {conditions.describe()}; {done} of {len(episodes)} episodes are there")
     started_ns = time.monotonic_ns()
     with BenchProgress(len(episodes), done) as progress:
         run_episodes(
@@ -205,7 +204,7 @@ def _run(
             stopped=lambda: bool(stop),
             watcher=progress.watcher,
         )
-    _say(f"{name}: done in {duration((time.monotonic_ns() - started_ns) / 1e9)}")
+    _print(f"{name}: done in {duration((time.monotonic_ns() - started_ns) / 1e9)}")
 
 
 def _report(
@@ -217,12 +216,12 @@ def _report(
     for name, folder in plan.folders.items():
         path = args.out / "runs" / folder
         found = read_results(path) if path.is_dir() else []
-        told = read_result(path) if (path / RESULT).is_file() else {"summary": {"finished": False}}
-        if not found or not told["summary"]["finished"]:
+        result = read_result(path) if (path / RESULT).is_file() else {"summary": {"finished": False}}
+        if not found or not result["summary"]["finished"]:
             missing[name] = unfit.get(folder, f"{len(found)} of {asked} episodes so far")
             continue
         results[name] = found
-        trained = trained and bool(told["trained"])
+        trained = trained and bool(result["trained"])
     about = {
         "suite": args.suite,
         "asked": asked,
@@ -233,15 +232,6 @@ def _report(
     }
     described = {name: plan.conditions[name].describe() for name in results}
     return write_findings(args.out, about, judge_all(results, plan.claims), results, described, missing)
-
-
-def _say(line: str) -> None:
-    sys.stderr.write(f"{COMMAND}: {line}\n")
-
-
-def _fail(code: int, line: str) -> int:
-    _say(line)
-    return code
 
 
 if __name__ == "__main__":

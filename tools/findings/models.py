@@ -12,11 +12,10 @@ from typing import Final
 import numpy as np
 from safetensors import SafetensorError, safe_open
 
-from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, command_line, messages
 from tools.findings.rows import AFTER, BEFORE
 from tools.train.config.recipe import Recipe, RecipeError, load_recipe
-from tools.train.run.exported import COMMAND, ExportError, export_artifacts
-from tools.train.run.network_file import stage_weights
+from tools.train.run.network_file import COMMAND, ExportError, export_artifacts, stage_weights
 
 EXAMPLES: Final = """examples:
   edge-train all --preset nano --out out/run
@@ -30,9 +29,13 @@ exit codes: 0 done, 1 an export failed, 2 bad arguments or input, 130 interrupte
 """
 
 
+_EXITS: Final = {ExportError: EXIT_CHECK_FAILED, RecipeError: EXIT_BAD_INPUT, OSError: EXIT_BAD_INPUT}
+_print = messages("findings-models")
+
+
 @dataclass(frozen=True)
 class Model:
-    """What is exported as `name`: a stage's weights of a run."""
+    """A model to export as `name`: a stage's weights of a run."""
 
     name: str
     weights: Path
@@ -89,34 +92,19 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
+@command_line("findings-models", _EXITS)
 def main(argv: Sequence[str] | None = None, command: Sequence[str] = COMMAND) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
-    try:
-        models = list(models_of(args.run, args.ablations))
-        if not models:
-            raise RecipeError(f"{args.run}: has no weights yet; run edge-train imitate first")
-        for model in models:
-            _say(f"{model.name}: {model.weights}")
-            if model.name == AFTER and model.weights == stage_weights(args.run, "imitate"):
-                _say(f"{AFTER}: reinforcement learning has left no policy of its own; this is imitation's")
-            export_artifacts(model.weights, model.recipe.model, args.out / model.name, command=command)
-    except ExportError as error:
-        return _fail(EXIT_CHECK_FAILED, str(error))
-    except (RecipeError, OSError) as error:
-        return _fail(EXIT_BAD_INPUT, str(error))
-    except KeyboardInterrupt:
-        return _fail(EXIT_INTERRUPTED, "interrupted; run it again to go on")
+    models = list(models_of(args.run, args.ablations))
+    if not models:
+        raise RecipeError(f"{args.run}: has no weights yet; run edge-train imitate first")
+    for model in models:
+        _print(f"{model.name}: {model.weights}")
+        if model.name == AFTER and model.weights == stage_weights(args.run, "imitate"):
+            _print(f"{AFTER}: reinforcement learning has left no policy of its own; this is imitation's")
+        export_artifacts(model.weights, model.recipe.model, args.out / model.name, command=command)
     return EXIT_DONE
-
-
-def _say(line: str) -> None:
-    sys.stderr.write(f"findings-models: {line}\n")
-
-
-def _fail(code: int, line: str) -> int:
-    _say(line)
-    return code
 
 
 if __name__ == "__main__":

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-
 from edge.core.cli import write_whole
+from reporting.plot_style import BAD, COMMAND, GOOD, INK, MUTED, TRUTH, new_figure, png, tidy
 from sim_hil.benchmark.results.summary import interval_of, summarise
 from tools.findings.rows import SWEEP_S
-from tools.findings.verdict import FAILS, HOLDS, Judged, Results
+from tools.findings.verdict import FAILS, HOLDS, OPEN, Judged, Results
 
 SCHEMA: Final = 1
-COLOURS: Final = {HOLDS: "#2c8c4a", FAILS: "#b3261e"}
-OPEN_COLOUR: Final = "#5b6774"
+COLOURS: Final = {HOLDS: GOOD, FAILS: BAD, OPEN: MUTED}
 NAMES: Final = {"sr": "SR", "spl": "SPL", "cr": "CR", "ne_m": "NE"}
 HOW: Final = """\
 Each run drives the same episodes; a difference is taken episode by episode. Intervals are of 95 %, percentile
@@ -34,24 +32,6 @@ beside it; with five of them one may hold by chance.
 """
 
 
-def findings_json(
-    about: Mapping[str, object],
-    judged: Sequence[Judged],
-    results: Results,
-    described: Mapping[str, str],
-    missing: Mapping[str, str],
-) -> dict[str, Any]:
-    """What findings.json holds; `described` and `missing` say of each run its conditions, or why it is not there."""
-    return {
-        "schema": SCHEMA,
-        **about,
-        "findings": [each.as_json() for each in judged],
-        "runs": {name: {"conditions": described[name], **summarise(results[name])} for name in results},
-        "not_run": dict(missing),
-        "tagged": "measured",
-    }
-
-
 def write_findings(
     out: Path,
     about: Mapping[str, object],
@@ -60,8 +40,18 @@ def write_findings(
     described: Mapping[str, str],
     missing: Mapping[str, str],
 ) -> dict[str, Any]:
-    """Write findings.md, findings.json and the pictures; returns the JSON."""
-    content = findings_json(about, judged, results, described, missing)
+    """Write findings.md, findings.json and the pictures; return the JSON.
+
+    `described` and `missing`: the conditions of each run, or why it is not there.
+    """
+    content = {
+        "schema": SCHEMA,
+        **about,
+        "findings": [asdict(each) for each in judged],
+        "runs": {name: {"conditions": described[name], **summarise(results[name])} for name in results},
+        "not_run": dict(missing),
+        "tagged": "measured",
+    }
     write_whole(out / "findings.json", json.dumps(content, indent=1) + "\n")
     pictures = []
     if judged:
@@ -117,9 +107,10 @@ def _row(each: Judged) -> str:
     )
 
 
-def _change(told: Mapping[str, Any]) -> str:
-    interval = told["ci95"]
-    return f"{told['difference']:+.1f}" + ("" if interval is None else f" ({interval[0]:+.1f} to {interval[1]:+.1f})")
+def _change(difference: Mapping[str, Any]) -> str:
+    interval = difference["ci95"]
+    span = "" if interval is None else f" ({interval[0]:+.1f} to {interval[1]:+.1f})"
+    return f"{difference['difference']:+.1f}{span}"
 
 
 def _mean(run: Mapping[str, Any], key: str) -> str:
@@ -129,29 +120,27 @@ def _mean(run: Mapping[str, Any], key: str) -> str:
 
 def draw_findings(judged: Sequence[Judged], path: Path) -> Path:
     """Every claim's number with its interval and its bound, one row each."""
-    figure = Figure(figsize=(9.0, 1.0 + 0.42 * len(judged)), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(9.0, 1.0 + 0.42 * len(judged))
     axis = figure.subplots()
     for row, each in enumerate(reversed(judged)):
-        colour = COLOURS.get(each.verdict, OPEN_COLOUR)
+        colour = COLOURS[each.verdict]
         low, high = each.ci95 or (each.value, each.value)
         axis.plot((low, high), (row, row), color=colour, linewidth=2.5, solid_capstyle="butt")
         axis.plot((each.value,), (row,), "o", color=colour, markersize=6)
-        axis.plot((each.least, each.least), (row - 0.35, row + 0.35), color="#1d2733", linewidth=1.2, linestyle=":")
+        axis.plot((each.least, each.least), (row - 0.35, row + 0.35), color=INK, linewidth=1.2, linestyle=":")
+    tidy(axis)
     axis.set_yticks(range(len(judged)), [f"{each.claim} (n {each.n})" for each in reversed(judged)], fontsize=8)
     axis.set_xlabel("points, with the interval of 95 %; dotted: the bound")
-    axis.axvline(0.0, color="#1d2733", linewidth=0.8)
-    axis.grid(axis="x", color="#dfe4e9", linewidth=0.6)
-    figure.savefig(path, dpi=120, metadata={"Software": None})
+    axis.axvline(0.0, color=INK, linewidth=0.8)
+    path.write_bytes(png(figure))
     return path
 
 
 def draw_latency(results: Results, path: Path) -> Path:
     """SR and CR over latency, before and after PPO (the paper's Figure 5)."""
-    figure = Figure(figsize=(8.0, 3.4), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(8.0, 3.4)
     for axis, metric in zip(figure.subplots(1, 2), ("sr", "cr"), strict=True):
-        for prefix, label, colour in (("no-rl", "before PPO", "#d1603d"), ("rl", "after PPO", "#1f6f8b")):
+        for prefix, label, colour in (("no-rl", "before PPO", COMMAND), ("rl", "after PPO", TRUTH)):
             seconds = [s for s in SWEEP_S if results.get(f"{prefix}-{s}s")]
             means = [summarise(results[f"{prefix}-{s}s"])[metric] for s in seconds]
             intervals = [
@@ -163,7 +152,7 @@ def draw_latency(results: Results, path: Path) -> Path:
         axis.set_xlabel("latency of reasoning, s")
         axis.set_ylabel(f"{NAMES[metric]}, %")
         axis.set_ylim(0, 100)
-        axis.grid(color="#dfe4e9", linewidth=0.6)
+        tidy(axis)
         axis.legend(frameon=False, fontsize=8)
-    figure.savefig(path, dpi=120, metadata={"Software": None})
+    path.write_bytes(png(figure))
     return path

@@ -22,7 +22,7 @@ LONG_S: Final = (3, 4, 5)
 SWAP_SEED: Final = 1
 NO_REASONING_S: Final = 0.25  # the paper's 4 Hz (section 4.4)
 DRIFT_LEAST: Final = -10.0
-"""Points of SR that may be lost under typical drift and count as none: as many as other words may cost."""
+"""Loss of SR under typical drift that still counts as none, points; the same for other wordings."""
 WORDING_LEAST: Final = -10.0
 SWAP_LEAST: Final = 30.0
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Final
 
 from sim_hil.benchmark.results.bootstrap import Range, mean_ci95
@@ -40,10 +40,6 @@ class Judged:
     runs: tuple[str, ...]
     also: Mapping[str, Any]
     """Differences of the other metrics, where there is one pair of runs."""
-
-    def as_json(self) -> dict[str, Any]:
-        """For findings.json."""
-        return asdict(self)
 
 
 def verdict_of(interval: Range | None, least: float) -> str:
@@ -92,8 +88,8 @@ def _finding(claim: Finding, results: Results) -> Judged:
     interval = mean_ci95(gain, tasks, None if span is None else (-span, span))
     also: dict[str, Any] = {}
     if len(claim.pairs) == 1 and not claim.minus:
-        told = compare(results[claim.pairs[0][0]], results[claim.pairs[0][1]])["differences"]
-        also = {name: told[name] for name in OTHERS}
+        differences = compare(results[claim.pairs[0][0]], results[claim.pairs[0][1]])["differences"]
+        also = {name: differences[name] for name in OTHERS}
     return Judged(
         claim.row, claim.claim, claim.source, claim.metric, len(order), round(before, 3), round(after, 3),
         round(sum(gain) / len(gain), 3), _rounded(interval), claim.least, verdict_of(interval, claim.least),

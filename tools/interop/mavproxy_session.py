@@ -62,9 +62,9 @@ class MavProxy:
         self.output += seen
         if answer and found is None:
             raise RuntimeError(f"{line!r}: expected {answer!r} within {seconds:g} s, found {self.output[-2000:]!r}")
-        said = "" if found is None else found[0].strip()
-        self.steps.append({"typed": line, "answer": said, "after_s": round(time.monotonic() - begin, 2)})
-        return said
+        matched = "" if found is None else found[0].strip()
+        self.steps.append({"typed": line, "answer": matched, "after_s": round(time.monotonic() - begin, 2)})
+        return matched
 
     def close(self) -> None:
         """End it."""

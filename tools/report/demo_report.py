@@ -11,14 +11,14 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from edge.core.cli import OutputError, command_line, write_result, write_whole
-from reporting import page
+from reporting.page import Cell, Figure, Table, mark, render
+from reporting.plot_style import delay_histogram
 from tools.report import figures
 from tools.report.checks import Check, acceptance
 from tools.report.numbers import Number, delay_at_call, headline, numbers
@@ -38,37 +38,16 @@ SHEET_FRAMES = 12
 _FRAME_WIDTH_PX = 480
 
 
-@dataclass(frozen=True)
 class RunFiles:
-    """Where the files of one demo run lie."""
+    """Paths of the files of one demo run."""
 
-    out: Path
-    artifacts: Path
-
-    @property
-    def settings(self) -> Path:
-        """What the demo was asked for, written before it starts."""
-        return self.out / "settings.json"
-
-    @property
-    def flight_log(self) -> Path:
-        """Recorded by edge-run."""
-        return self.out / "flight.mcap"
-
-    @property
-    def trace(self) -> Path:
-        """Written by edge-hil."""
-        return self.out / "hil_trace.jsonl"
-
-    @property
-    def report(self) -> Path:
-        """The page."""
-        return self.out / "report.html"
-
-    @property
-    def summary(self) -> Path:
-        """The acceptance numbers."""
-        return self.out / "demo.json"
+    def __init__(self, out: Path, artifacts: Path) -> None:
+        self.out, self.artifacts = out, artifacts
+        self.settings = out / "settings.json"
+        self.flight_log = out / "flight.mcap"
+        self.trace = out / "hil_trace.jsonl"
+        self.report = out / "report.html"
+        self.summary = out / "demo.json"
 
     def result(self, command: str) -> Path:
         """JSON result of one command (`edge-run` → run.json)."""
@@ -95,7 +74,7 @@ def write_report(files: RunFiles, *, wall_s: float) -> Record:
     try:
         checks = acceptance(data)
         summary = _summary(data, checks, wall_s)
-        html = page.document("TIC-VLA edge: demo run", _body(data, checks, wall_s))
+        html = _page(data, checks, wall_s)
     except ReportError:
         raise
     except MISSHAPEN as error:
@@ -122,98 +101,86 @@ def _summary(data: RunData, checks: Sequence[Check], wall_s: float) -> Record:
     }
 
 
-def _body(data: RunData, checks: Sequence[Check], wall_s: float) -> str:
-    failed = [check for check in checks if not check.passed]
-    verdict = f"{len(failed)} of {len(checks)} checks failed" if failed else f"all {len(checks)} checks passed"
-    scene = data.trace.scene
-    run = data.log.run
-    parts = [
-        "<h1>TIC-VLA edge: the whole loop on a simulated Go2</h1>",
-        f'<p><span class="verdict {"bad" if failed else "good"}">{verdict}</span></p>',
-        f"<p>Instruction: <b>{page.text_html(str(run.get('instruction', 'not recorded')))}</b></p>",
-        f'<p class="quiet">Scene “{page.text_html(str(scene["name"]))}”, {data.results["edge-hil"]["people"]} people, '
-        f"seed {data.results['edge-hil']['seed']}, {data.duration_s:.1f} s of real time. The runner knows only the "
-        "robot's protocol; the paths and speeds called true come from the simulator.</p>",
-        _untrained_notice(data),
-        page.tiles(headline(data)),
-        "<h2>Where the robot walked</h2>",
-        page.figure(
+def _page(data: RunData, checks: Sequence[Check], wall_s: float) -> str:
+    failed = sum(not check.passed for check in checks)
+    model, hil = data.manifest.get("model", {}), data.results["edge-hil"]
+    machine = data.settings.get("machine")
+    close_up = figures.close_up(data)
+    delays_s = np.array([t["delay_s"] for t in data.log.ticks if t["delay_s"] is not None], float)
+    maps = [
+        Figure(
             figures.top_down(data),
             "Top-down picture of the path among walls, objects and people",
             "Ground truth from the simulator in the world frame. The dashed line is what the runner believed from "
             "the robot's odometry.",
             wide=True,
-        ),
-        _close_up(data),
-        "<h2>What the camera saw and what the VLM said</h2>",
-        '<p class="quiet">Each picture is the newest frame the generation was given (its anchor); below it the '
-        "VLM's output, as it came.</p>",
-        _contact_sheet(data),
-        "<h2>Time</h2>",
-        page.figure(
+        )
+    ]
+    if close_up is not None:
+        maps.append(Figure(close_up, "Close-up of the path", "The same, close to the path.", wide=True))
+    return render(
+        "demo",
+        title="TIC-VLA edge: demo run",
+        passed=not failed,
+        verdict=f"{failed} of {len(checks)} checks failed" if failed else f"all {len(checks)} checks passed",
+        instruction=str(data.log.run.get("instruction", "not recorded")),
+        scene=str(data.trace.scene["name"]),
+        people=hil["people"],
+        seed=hil["seed"],
+        duration_s=data.duration_s,
+        untrained=isinstance(model, dict) and model.get("trained") is False,
+        tiles=headline(data),
+        maps=maps,
+        cards=_cards(data),
+        time_line=Figure(
             figures.time_line(data),
             "Time line of delay, forward speed and turn rate",
             "Δt rises between generations and falls when a newer one is released. Shaded: ticks that did not drive "
             "(no semantic state yet, stale input or stopping).",
             wide=True,
         ),
-        '<div class="pair">',
-        page.figure(
-            figures.tick_histogram(data.log.tick_ms),
-            "Histogram of control tick durations",
-            "Every control tick, from its deadline to its command sent; the loop runs at 10 Hz.",
-        ),
-        page.figure(
-            figures.delay_histogram(
-                np.array([t["delay_s"] for t in data.log.ticks if t["delay_s"] is not None], float)
+        histograms=[
+            Figure(
+                figures.tick_histogram(data.log.tick_ms),
+                "Histogram of control tick durations",
+                "Every control tick, from its deadline to its command sent; the loop runs at 10 Hz.",
             ),
-            "Histogram of the delay",
-            "How old the semantic state was when the action expert used it.",
+            Figure(
+                delay_histogram(delays_s),
+                "Histogram of the delay",
+                "How old the semantic state was when the action expert used it.",
+            ),
+        ],
+        checks=_check_table(checks, beside={"delay_error_ms": delay_at_call(data)}),
+        numbers=Table(
+            ("number", "value", "kind", "source"),
+            [(n.title, n.value, n.kind, n.source) for n in numbers(data, wall_s)],
+            numeric=frozenset({1}),
         ),
-        "</div>",
-        "<h2>Checks</h2>",
-        _check_table(checks, beside={"delay_error_ms": delay_at_call(data)}),
-        "<h2>Numbers</h2>",
-        _number_table(numbers(data, wall_s)),
-        "<h2>Machine</h2>",
-        _machine_table(data.settings.get("machine")),
-    ]
-    return "\n".join(part for part in parts if part)
-
-
-def _machine_table(facts: object) -> str:
-    """The machine of the run, as the demo noted it: the report may be written on another one."""
-    if not isinstance(facts, dict):
-        return "<p>settings.json does not say on which machine this was measured.</p>"
-    return page.table(("what", "value"), [(page.text_html(k), page.text_html(str(v))) for k, v in facts.items()])
-
-
-def _untrained_notice(data: RunData) -> str:
-    model = data.manifest.get("model", {})
-    if not isinstance(model, dict) or model.get("trained") is not False:
-        return ""
-    return (
-        '<p class="notice"><b>The weights are untrained</b> (initialised from a seed). The robot walks where random '
-        "numbers send it and does not find the vending machine yet; the text under the pictures is noise. What this "
-        "run shows is that the loop works: timing, delays, protocol and stop.</p>"
+        # The machine of the run, as the demo noted it: the report may be written on another one.
+        machine=Table(("what", "value"), [(key, str(value)) for key, value in machine.items()])
+        if isinstance(machine, dict)
+        else None,
     )
 
 
-def _close_up(data: RunData) -> str:
-    picture = figures.close_up(data)
-    return (
-        ""
-        if picture is None
-        else page.figure(picture, "Close-up of the path", "The same, close to the path.", wide=True)
-    )
-
-
-def _contact_sheet(data: RunData) -> str:
+def _cards(data: RunData) -> list[Record]:
+    """Return the generations of the contact sheet: their anchor frame (JPEG or None), facts and text."""
     chosen = spread(data.log.semantics, SHEET_FRAMES)
-    if not chosen:
-        return "<p>No generation was released in this run.</p>"
     frames = load_frames(data.log.path, {s["frames_ns"][-1] for s in chosen if s["frames_ns"]})
-    return f'<div class="sheet">{"".join(_card(data, s, frames) for s in chosen)}</div>'
+    cards = []
+    for semantic in chosen:
+        anchor_ns, generation, waypoints = semantic["anchor_ns"], semantic["generation"], semantic["waypoints"]
+        jpeg = frames.get(semantic["frames_ns"][-1] if semantic["frames_ns"] else -1)
+        points = "no waypoints in the text" if not waypoints else f"{len(waypoints)} waypoints"
+        meta = (
+            f"generation {generation:d} · seen at {round((anchor_ns - data.log.start_ns) / 1e9, 1) + 0.0:.1f} s · "
+            f"Δt {(semantic['ready_ns'] - anchor_ns) / 1e9:.2f} s at release · {semantic['new_tokens']:d} tokens · "
+            f"{points}"
+        )
+        shown = None if jpeg is None else _shrink(jpeg)
+        cards.append({"jpeg": shown, "generation": generation, "meta": meta, "text": semantic["text"]})
+    return cards
 
 
 def spread(items: Sequence[Record], count: int) -> list[Record]:
@@ -221,25 +188,6 @@ def spread(items: Sequence[Record], count: int) -> list[Record]:
     if len(items) <= count:
         return list(items)
     return [items[round(i * (len(items) - 1) / (count - 1))] for i in range(count)]
-
-
-def _card(data: RunData, semantic: Record, frames: dict[int, bytes]) -> str:
-    anchor_ns, generation = semantic["anchor_ns"], semantic["generation"]
-    jpeg = frames.get(semantic["frames_ns"][-1] if semantic["frames_ns"] else -1)
-    if jpeg is None:
-        picture = "<p>(the frame is not in the flight log)</p>"
-    else:
-        uri = page.image_uri(_shrink(jpeg), "jpeg")
-        picture = f'<img src="{uri}" alt="Camera frame of generation {generation:d}">'
-    released_s = (semantic["ready_ns"] - anchor_ns) / 1e9
-    waypoints = semantic["waypoints"]
-    points = "no waypoints in the text" if not waypoints else f"{len(waypoints)} waypoints"
-    return (
-        f'<figure>{picture}<div class="meta">generation {generation:d} · seen at '
-        f"{round((anchor_ns - data.log.start_ns) / 1e9, 1) + 0.0:.1f} s · Δt {released_s:.2f} s at release · "
-        f"{semantic['new_tokens']:d} tokens · {points}</div>"
-        f'<pre class="vlm">{page.text_html(semantic["text"]) or "(empty)"}</pre></figure>'
-    )
 
 
 def _shrink(jpeg: bytes) -> bytes:
@@ -252,27 +200,21 @@ def _shrink(jpeg: bytes) -> bytes:
     return cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 82])[1].tobytes()
 
 
-def _check_table(checks: Sequence[Check], beside: Mapping[str, Number]) -> str:
+def _check_table(checks: Sequence[Check], beside: Mapping[str, Number]) -> Table:
     """All checks; `beside` names numbers that belong under a check without being one."""
-    rows = []
+    rows: list[Sequence[str | Cell]] = []
     for check in checks:
-        mark = '<span class="pass">pass</span>' if check.passed else '<span class="fail">FAIL</span>'
-        limit = f"{check.rule} {_words(check.limit)} {check.unit}".strip()
-        value = f"{_words(check.value)} {check.unit}".strip()
-        rows.append((mark, page.text_html(check.title), value, limit, "measured", page.text_html(check.note)))
+        limit = f"{check.rule} {_value(check.limit)} {check.unit}".strip()
+        value = f"{_value(check.value)} {check.unit}".strip()
+        verdict = mark(check.passed, "pass" if check.passed else "FAIL")
+        rows.append((verdict, check.title, value, limit, "measured", check.note))
         if (number := beside.get(check.name)) is not None:
-            title, source = page.text_html(number.title), page.text_html(number.source)
-            rows.append(("–", title, page.text_html(number.value), "no check", number.kind, source))
+            rows.append(("–", number.title, number.value, "no check", number.kind, number.source))
     head = ("", "check", "value", "required", "kind", "note")
-    return page.table(head, rows, numeric=frozenset({2, 3}))
+    return Table(head, rows, numeric=frozenset({2, 3}))
 
 
-def _number_table(items: Sequence[Number]) -> str:
-    rows = [(page.text_html(n.title), page.text_html(n.value), n.kind, page.text_html(n.source)) for n in items]
-    return page.table(("number", "value", "kind", "source"), rows, numeric=frozenset({1}))
-
-
-def _words(value: float | int | bool | None) -> str:
+def _value(value: float | int | bool | None) -> str:
     if value is None:
         return "none"
     if isinstance(value, bool):

@@ -13,22 +13,21 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import StrMethodFormatter
 
 from reporting.plot_style import (
+    BAD,
     COMMAND,
+    GOOD,
     INK,
     MUTED,
     PERSON,
     TRUTH,
     WALL,
-    delay_histogram,
+    draw_histogram,
     legend_above,
     new_figure,
-    percentile,
     png,
     tidy,
 )
 from tools.report.run_data import Array, Record, RunData, odometry_in_world
-
-__all__ = ["close_up", "delay_histogram", "tick_histogram", "time_line", "top_down"]
 
 OVERHEAD_KINDS = frozenset({"light", "sign"})  # nobody meets them on the floor
 FLAT_KINDS = frozenset({"door", "window", "notice_board"})  # on a wall
@@ -84,7 +83,7 @@ def _top_down_legend() -> list[Line2D]:
         Line2D([], [], color=TRUTH, linewidth=3, label="true path"),
         Line2D([], [], color=COMMAND, linestyle=(0, (4, 2)), label="odometry, laid on at the first tick"),
         Line2D([], [], color=PERSON, linewidth=1.2, label="people (dot: at the end)"),
-        Line2D([], [], color="#2c8c4a", marker="o", linestyle="", markersize=8, label="start"),
+        Line2D([], [], color=GOOD, marker="o", linestyle="", markersize=8, label="start"),
         Line2D([], [], color="#b8860b", marker="*", linestyle="", markersize=11, label="goal"),
         Line2D([], [], color=INK, marker="X", linestyle="", markersize=8, label="end"),
     ]
@@ -164,35 +163,31 @@ def _draw_path(axes: Axes, pose: Array, time_s: Array) -> LineCollection:
 
 def _draw_start_goal(axes: Axes, scene: Record, end: Array) -> None:
     x_m, y_m, theta = scene["start"]
-    axes.plot(x_m, y_m, marker="o", color="#2c8c4a", markersize=9, markeredgecolor="white", zorder=8)
+    axes.plot(x_m, y_m, marker="o", color=GOOD, markersize=9, markeredgecolor="white", zorder=8)
     axes.plot(*scene["goal"], marker="*", color="#b8860b", markersize=15, markeredgecolor="white", zorder=8)
     axes.plot(end[0], end[1], marker="X", color=INK, markersize=9, markeredgecolor="white", zorder=9)
     axes.annotate(
         "",
         (x_m + 0.6 * np.cos(theta), y_m + 0.6 * np.sin(theta)),
         (x_m, y_m),
-        arrowprops={"arrowstyle": "->", "color": "#2c8c4a", "lw": 1.6},
+        arrowprops={"arrowstyle": "->", "color": GOOD, "lw": 1.6},
         zorder=8,
     )
 
 
 def tick_histogram(durations_ms: Array) -> bytes:
-    """Duration of every control tick with the 100 ms deadline; counts on a log scale, so that one outlier shows."""
+    """Draw the duration of every control tick, ms; counts on a log scale, so that one outlier shows."""
     figure = new_figure(5.4, 3.1)
     axes = figure.add_subplot()
-    p50, p99 = percentile(durations_ms, 50), percentile(durations_ms, 99)
     right = max(_DEADLINE_MS * 1.1, float(durations_ms.max()) * 1.05)
-    axes.hist(durations_ms, bins=np.arange(0, right + 1, max(1.0, right / 200)).tolist(), color=TRUTH, log=True)
-    axes.axvline(_DEADLINE_MS, color="#b3261e", linewidth=1.6, label="deadline 100 ms")
-    axes.axvline(p50, color=INK, linewidth=1, linestyle=":", label=f"p50 {p50:.1f} ms")
-    axes.axvline(p99, color=INK, linewidth=1, linestyle="--", label=f"p99 {p99:.1f} ms")
-    axes.axvline(durations_ms.max(), color=MUTED, linewidth=1, label=f"max {durations_ms.max():.1f} ms")
+    axes.axvline(_DEADLINE_MS, color=BAD, linewidth=1.6, label="deadline 100 ms")
+    draw_histogram(axes, durations_ms, max(1.0, right / 200), TRUTH, "ms", 1)
     axes.set_xlim(0, right)
     axes.set_xlabel("tick duration in ms", fontsize=9)
+    axes.set_yscale("log")
     axes.set_ylim(bottom=0.7)
     axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axes.set_ylabel("ticks (log)", fontsize=9)
-    legend_above(axes)
     tidy(axes)
     return png(figure)
 

@@ -13,7 +13,7 @@ PACKAGES = ("tic-vla-edge", "onnxruntime", "numpy", "opencv-python-headless", "t
 
 
 def machine_facts() -> dict[str, str]:
-    """Name → value in words, in the order of the report."""
+    """Return the facts as text by name, in the order of the report."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     facts = {
         "processor": cpu_model(),

@@ -30,22 +30,18 @@ from edge.core.cli import (
     write_whole,
 )
 from edge.inference.latency_profile import load_profile
-from reporting.build_progress import duration, peak_rss_bytes
+from reporting.progress import duration, peak_rss_bytes
 from sim_hil.benchmark.runs import RunsError
-from tools.train.config.recipe import Recipe, load_recipe, recipe_names, stage_seed
-from tools.train.config.variants import VARIANTS
-from tools.train.pipeline import budget, chain
+from tools.train.config.checks import TrainError
+from tools.train.config.recipe import VARIANTS, Recipe, load_recipe, recipe_names, stage_seed
+from tools.train.pipeline import chain
 from tools.train.pipeline.chain import Step, is_done, may_begin, run_step, steps_of
 from tools.train.pipeline.model_card import ship, write_card
 from tools.train.run.curves import draw_curves
-from tools.train.run.distributed import SINGLE, Ranks, leave, ranks_of_environment
-from tools.train.run.exported import ExportError
-from tools.train.run.job import StageFailedError, StageJob, StopFlag
-from tools.train.run.network_file import START, import_start
-from tools.train.run.optim import computes_bf16
-from tools.train.run.own_drives import take_drives
-from tools.train.run.progress_display import progress_for
-from tools.train.run.run_dir import RunDir
+from tools.train.run.distributed import SINGLE, Ranks, computes_bf16, leave, ranks_of_environment
+from tools.train.run.job import StageFailedError, StageJob, StopFlag, progress_for
+from tools.train.run.network_file import START, ExportError, import_start
+from tools.train.run.run_dir import RunDir, take_drives
 
 COMMAND: Final = "edge-train"
 COMMANDS: Final = (*chain.ALL, "all", "card")
@@ -71,10 +67,6 @@ evaluate (episodes in layouts that no stage has used)
 exit codes: 0 done, 1 an export, a drive or an episode failed, 2 bad arguments or input, 3 refused (artifacts),
             130 interrupted
 """
-
-
-class UsageError(ValueError):
-    """Arguments that are missing or contradict each other; one line."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -165,28 +157,28 @@ def _main(args: argparse.Namespace) -> dict[str, Any]:
     steps = steps_of(args.command, recipe) if args.command != "card" else []
     if args.drives is not None:
         if args.command == "card":
-            raise UsageError("--drives belongs to stages, not to card")
+            raise TrainError("--drives belongs to stages, not to card")
         steps = [step for step in steps if step.stage != "collect" or not args.dry_run]
     if args.dry_run:
-        plan = budget.budget_of(recipe, steps, args.device)
-        sys.stderr.write("\n".join(budget.lines_of(recipe, steps, plan, args.device)) + "\n")
-        return {"command": args.command, "recipe": recipe.name, "budget": budget.as_json(plan)}
+        plan = chain.budget_of(recipe, steps, args.device)
+        sys.stderr.write("\n".join(chain.lines_of(recipe, steps, plan, args.device)) + "\n")
+        return {"command": args.command, "recipe": recipe.name, "budget": chain.as_json(plan)}
     if args.out is None:
-        raise UsageError("--out is missing: expected the folder of the run, e.g. --out out/run")
+        raise TrainError("--out is missing: expected the folder of the run, e.g. --out out/run")
     if args.command == "card":
         run_dir = RunDir(args.out)
         shipped = None if args.ship is None else str(ship(run_dir, recipe, args.ship, args.scores))
         return {"command": "card", "card": str(write_card(run_dir, recipe, args.scores)), "shipped": shipped}
     if args.scores or args.ship:
-        raise UsageError("--scores and --ship belong to card")
+        raise TrainError("--scores and --ship belong to card")
     if args.base is not None and args.checkpoint:
-        raise UsageError("--from and --checkpoint: expected one of them, both name the initial weights")
+        raise TrainError("--from and --checkpoint: expected one of them, both name the initial weights")
     if args.base is not None and args.drives is not None:
-        raise UsageError("--from and --drives: expected one of them, both name the drives")
+        raise TrainError("--from and --drives: expected one of them, both name the drives")
     if args.after is not None and args.drives is not None:
-        raise UsageError("--after and --drives: expected one of them, --after continues without earlier drives")
+        raise TrainError("--after and --drives: expected one of them, --after continues without earlier drives")
     if args.after is not None and not args.checkpoint:
-        raise UsageError("--after: expected --checkpoint with it, the weights that the step wrote")
+        raise TrainError("--after: expected --checkpoint with it, the weights that the step wrote")
     before = chain.steps_until(args.after, recipe, steps) if args.after is not None else []
     _check_device(args.device)
     with ranks_of_environment(args.device) as ranks, deterministic(args.device):
@@ -206,11 +198,11 @@ def _recipe(args: argparse.Namespace) -> Recipe:
     there = [folder / "recipe.toml" for folder in (args.out, args.base) if folder is not None]
     found = next((path for path in there if path.is_file()), None)
     if args.preset is not None and args.preset not in recipe_names():
-        raise UsageError(f"--preset {args.preset}: expected one of {', '.join(recipe_names())}; a file is a --recipe")
+        raise TrainError(f"--preset {args.preset}: expected one of {', '.join(recipe_names())}; a file is a --recipe")
     if args.recipe is not None and args.recipe.suffix != ".toml":
-        raise UsageError(f"--recipe {args.recipe}: expected a file that ends in .toml")
+        raise TrainError(f"--recipe {args.recipe}: expected a file that ends in .toml")
     if args.command == "card" and found is None:
-        raise UsageError("card: expected --out to be the folder of a run")
+        raise TrainError("card: expected --out to be the folder of a run")
     return load_recipe(str(args.preset or args.recipe or found or "nano"), settings)
 
 
@@ -230,9 +222,9 @@ def _check_device(device: str) -> None:
 
     kind, _, number = device.partition(":")
     if kind not in ("cpu", "cuda") or (number and not number.isdecimal()) or (kind == "cpu" and number):
-        raise UsageError(f"--device {device}: expected cpu, cuda or cuda:N")
+        raise TrainError(f"--device {device}: expected cpu, cuda or cuda:N")
     if kind == "cuda" and not torch.cuda.is_available():
-        raise UsageError(f"--device {device}: not found on this machine, or torch was built without CUDA")
+        raise TrainError(f"--device {device}: not found on this machine, or torch was built without CUDA")
 
 
 @contextmanager
@@ -258,7 +250,7 @@ def _train(
 ) -> dict[str, Any]:
     if ranks.world > 1 and not any(step.stage in chain.DISTRIBUTED for step in steps):
         shared = ", ".join((*chain.DISTRIBUTED, "dagger", "all"))
-        raise UsageError(f"{args.command}: runs in one process; torchrun is for {shared}")
+        raise TrainError(f"{args.command}: runs in one process; torchrun is for {shared}")
     run_dir = RunDir(args.out)
     with ranks.by_first() as here:
         if here:
@@ -312,7 +304,8 @@ def _step(
                 ranks=ranks,
                 stop=stop,
             )
-            if asks_bf16(recipe, step) and not computes_bf16(args.device):
+            optim = getattr(getattr(recipe, step.stage, None), "optim", None)
+            if getattr(optim, "bf16", False) and not computes_bf16(args.device):
                 progress.say("using float32: this processor has no bfloat16 instructions")
             result = run_step(job, step) if step.stage in chain.DISTRIBUTED else _alone(job, step)
     finally:
@@ -342,12 +335,6 @@ def _alone(job: StageJob, step: Step) -> dict[str, Any]:
     return job.run_dir.result(step.name if step.stage == "dagger" else step.stage) or {}
 
 
-def asks_bf16(recipe: Recipe, step: Step) -> bool:
-    """Return whether a stage's configuration requests bfloat16."""
-    optim = getattr(getattr(recipe, step.stage, None), "optim", None)
-    return bool(getattr(optim, "bf16", False))
-
-
 @contextmanager
 def stop_flag() -> Iterator[StopFlag]:
     """Yield a flag that the first Ctrl-C or SIGTERM sets: the stage ends with a checkpoint. The second interrupts."""
@@ -356,7 +343,7 @@ def stop_flag() -> Iterator[StopFlag]:
     def note(_number: int, _frame: FrameType | None) -> None:
         if flag.asked:
             raise KeyboardInterrupt
-        flag.ask()
+        flag.asked = True
         sys.stderr.write(f"{COMMAND}: stopping after this step, with a checkpoint; press again to stop immediately\n")
 
     before: dict[int, Callable[[int, FrameType | None], Any] | int | None] = {

@@ -19,12 +19,12 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, command_line, named_file
-from export.model.config import ModelConfigError, TicVlaConfig
-from export.model.config_file import config_from_dict
+from export.model.config import ModelConfigError, TicVlaConfig, config_from_dict
 from export.model.vision import VisionEncoder
 from sim_hil.benchmark.policies.point_goal_net import FORMAT, KEY
-from tools.train.imitate.point_goal_net import PointGoalFileError, PointGoalNet, load_point_goal
-from tools.train.run.network_file import NetworkFileError, read_network, weights_before
+from tools.train.config.checks import TrainError
+from tools.train.imitate.trainable_policies import PointGoalNet, load_point_goal
+from tools.train.run.network_file import read_network, weights_before
 
 OPSET: Final = 20
 
@@ -74,13 +74,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         run = args.weights.resolve().parent.parent
         before = weights_before(run, "imitate")
         if before is None:
-            raise NetworkFileError(f"{run}: no encoder weights found; expected FILE inside a run folder of edge-train")
+            raise TrainError(f"{run}: no encoder weights found; expected FILE inside a run folder of edge-train")
         with safe_open(str(before), framework="pt") as file:
             config = config_from_dict(json.loads((file.metadata() or {})["config"]))
         network = read_network(before, config, 0)
         net = load_point_goal(args.weights, config)
         export(network.vision, net, config, args.out, args.weights.parent.name)
-    except (OSError, SafetensorError, KeyError, ModelConfigError, NetworkFileError, PointGoalFileError) as error:
+    except (OSError, SafetensorError, KeyError, ModelConfigError, TrainError) as error:
         sys.stderr.write(f"point_goal_export: {error}\n")
         return EXIT_BAD_INPUT
     return EXIT_DONE

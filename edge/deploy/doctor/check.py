@@ -1,4 +1,4 @@
-"""One line of `edge-doctor`: what was looked at, what was found, what was expected, what to do."""
+"""One line of `edge-doctor`: what was checked, what was found, what was expected, what to do."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Level(Enum):
     FAIL = "fail"
     """The robot must not be driven like this, or would refuse to."""
     SKIP = "skip"
-    """Could not be looked at here; `found` says why."""
+    """Could not be checked here; `found` tells why."""
 
 
 _STYLES = {Level.OK: "green", Level.WARN: "yellow", Level.FAIL: "bold red", Level.SKIP: "dim"}

@@ -1,4 +1,4 @@
-"""`edge-doctor`: looks at this machine, the artifacts and the way to the robot, and says what to do about it."""
+"""`edge-doctor`: checks this machine, the artifacts and the link to the robot, and tells what to do."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ from edge.core.cli import (
     EXIT_BAD_INPUT,
     EXIT_CHECK_FAILED,
     EXIT_DONE,
-    EXIT_INTERRUPTED,
     check_result_target,
     command_line,
+    messages,
     write_result,
 )
-from edge.core.device import available_providers
-from edge.deploy.doctor import cable as doctor_cable
+from edge.core.device import available_providers, package_version
 from edge.deploy.doctor import graphs as doctor_graphs
 from edge.deploy.doctor import machine as doctor_machine
 from edge.deploy.doctor import rights as doctor_rights
 from edge.deploy.doctor import robot as doctor_robot
+from edge.deploy.doctor import runtime as doctor_runtime
 from edge.deploy.doctor.check import Check, Level, failed, skipped, table
-from edge.deploy.doctor.user import Whom, user_named
+from edge.deploy.doctor.rights import UserRights, user_named
 from edge.deploy.unit_check import run_command
 from edge.inference import engines
 from edge.inference.graph import GraphError
@@ -52,14 +52,14 @@ EXAMPLES = """examples:
        --socket /run/tic-vla-edge/bridge.sock --user tic-vla-runner
   edge-doctor
 
-What is not given is not looked at, and said so. It opens the graphs and runs ticks on a black picture; it asks the
-bridge and the robot for their state and one picture, and never commands anything.
+What is not given is not checked and shown as skipped. It opens the graphs and runs ticks on a black picture; it asks
+the bridge and the robot for their state and one picture, and never commands anything.
 exit codes: 0 no check failed (warnings may have been given), 1 a check failed, 2 bad arguments, 130 interrupted
 """
 TICKS = 100
 TICK_BUDGET_S = 20.0
-LOOK_S = 0.5
-"""Between two looks at what other programs use."""
+SETTLE_S = 0.5
+"""Between two readings of what other programs use."""
 ROOT = Path("/")
 T = TypeVar("T")
 
@@ -76,38 +76,27 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--socket", type=Path, metavar="PATH", help="socket of edge-bridge (default: the robot file's)")
     p.add_argument("--domain", type=int, metavar="N", help="DDS domain (default: the robot file's)")
     p.add_argument("--logs", type=Path, metavar="DIR", help=f"where flight logs go (default: {STATE_DIRECTORY} or .)")
-    p.add_argument("--user", metavar="NAME", help="whose rights are judged, e.g. the service's (default: yours)")
+    p.add_argument("--user", metavar="NAME", help="user whose rights are checked, e.g. the service's (default: you)")
     p.add_argument("--ticks", type=int, default=TICKS, metavar="N", help=f"ticks to time (default: {TICKS}; 0: none)")
     p.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     return p
 
 
-def _say(line: str) -> None:
-    sys.stderr.write(f"edge-doctor: {line}\n")
-    sys.stderr.flush()
-
-
-@command_line("edge-doctor")
+@command_line("edge-doctor", {OSError: EXIT_BAD_INPUT, ConfigError: EXIT_BAD_INPUT})
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
     started_ns = time.monotonic_ns()
-    try:
-        check_result_target(args.json)
-        if args.ticks < 0:
-            raise ConfigError(f"--ticks {args.ticks}: expected 0 or more")
-        checks = list(examine(args))
-    except (OSError, ConfigError) as error:
-        _say(str(error))
-        return EXIT_BAD_INPUT
-    except KeyboardInterrupt:
-        _say("interrupted")
-        return EXIT_INTERRUPTED
+    check_result_target(args.json)
+    if args.ticks < 0:
+        raise ConfigError(f"--ticks {args.ticks}: expected 0 or more")
+    checks = list(examine(args))
     # The table is for people; with --json - standard output is the JSON's alone.
     Console(stderr=args.json == "-").print(table(checks))
     counts = {level.value: sum(check.level is level for check in checks) for level in Level}
     wall_s = round((time.monotonic_ns() - started_ns) / 1e9, 3)
-    _say(", ".join(f"{number} {level}" for level, number in counts.items()) + f" in {wall_s:.1f} s")
+    numbers = ", ".join(f"{number} {level}" for level, number in counts.items())
+    messages("edge-doctor")(f"{numbers} in {wall_s:.1f} s")
     result: dict[str, Any] = {"ok": not failed(checks), "counts": counts, "wall_s": wall_s}
     result["checks"] = [check.to_dict() for check in checks]
     write_result(args.json, result)
@@ -115,8 +104,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def examine(args: argparse.Namespace, root: Path = ROOT) -> Iterator[Check]:
-    """Every check, in the order in which they are shown; `root`: where Linux's files are looked for."""
-    whom = user_named(args.user)
+    """Every check, in the order in which they are shown; `root`: where Linux's files are read."""
+    user = user_named(args.user)
     # Before anything of ours computes.
     busy = _busy(root / "proc")
     robot, robot_check = _robot(args)
@@ -127,24 +116,24 @@ def examine(args: argparse.Namespace, root: Path = ROOT) -> Iterator[Check]:
     power: PowerPlan | None = None
     refused: list[Check] = []
     if loaded is not None:
-        directory, artifacts = loaded.directory, loaded
-        facts = _said(refused, "target in the manifest", lambda: target_facts(read_manifest(directory)))
-        plan = _said(refused, "plan in the manifest", lambda: plan_facts(read_manifest(directory)))
-        power = _said(refused, "power plan in the manifest", lambda: read_power_plan(artifacts))
+        artifacts = loaded
+        facts = _read_facts(refused, "target in the manifest", lambda: target_facts(read_manifest(artifacts.directory)))
+        plan = _read_facts(refused, "plan in the manifest", lambda: plan_facts(read_manifest(artifacts.directory)))
+        power = _read_facts(refused, "power plan in the manifest", lambda: read_power_plan(artifacts))
     yield from refused
     yield from _machine(args, root, loaded, facts, plan)
     yield busy
-    yield from _rights(root, loaded, power, robot, whom)
+    yield from _rights(root, loaded, power, robot, user)
     yield from _graphs(args, loaded, plan)
     yield robot_check
     if robot is not None:
-        yield doctor_cable.cable(robot.dds.interface, root)
+        yield doctor_robot.cable(robot.dds.interface, root)
         yield doctor_robot.bridge(robot)
         yield from doctor_robot.robot_link(robot, 448 if loaded is None else loaded.runtime.image_px)
 
 
-def _said(refused: list[Check], name: str, read: Callable[[], T]) -> T | None:
-    """What the artifacts say of something; None, and a check in `refused`, where they say nonsense."""
+def _read_facts(refused: list[Check], name: str, read: Callable[[], T]) -> T | None:
+    """Facts from the manifest; None, and a failed check in `refused`, where it is not as edge-export writes it."""
     try:
         return read()
     except ArtifactError as error:
@@ -155,7 +144,7 @@ def _said(refused: list[Check], name: str, read: Callable[[], T]) -> T | None:
 def _robot(args: argparse.Namespace) -> tuple[RobotConfig | None, Check]:
     name = "robot file"
     if args.robot is None:
-        return None, skipped(name, "no --robot, so neither bridge, robot nor camera is looked at")
+        return None, skipped(name, "no --robot, so neither bridge, robot nor camera is checked")
     try:
         robot = load_robot_config(args.robot, socket=args.socket, domain=args.domain)
     except ConfigError as error:
@@ -181,12 +170,13 @@ def _artifacts(args: argparse.Namespace) -> tuple[Artifacts | None, Check]:
 def _machine(
     args: argparse.Namespace, root: Path, artifacts: Artifacts | None, facts: TargetFacts | None, plan: PlanFacts | None
 ) -> Iterator[Check]:
+    wanted = sorted({graph.session.provider for graph in artifacts.graphs.values()}) if artifacts is not None else []
+    yield doctor_runtime.onnx_runtime(wanted, available_providers(), package_version, platform.machine(), root)
     if artifacts is None or facts is None:
         yield skipped("target", "the artifacts name none" if artifacts is not None else "no artifacts")
         yield skipped("power mode", "no target")
     else:
-        providers = sorted({graph.session.provider for graph in artifacts.graphs.values()})
-        yield doctor_machine.match(facts, providers, platform.machine(), available_providers(), root)
+        yield doctor_machine.match(facts, wanted, platform.machine(), available_providers(), root)
         yield doctor_machine.power_mode(facts.power_mode, root, _nvpmodel)
     yield doctor_machine.clocks(root)
     yield doctor_machine.cpu_governor(root)
@@ -215,28 +205,28 @@ def _disk_usage(folder: Path) -> tuple[int, int]:
 
 def _busy(proc: Path) -> Check:
     before, started_ns = doctor_machine.processor_ticks(proc), time.monotonic_ns()
-    time.sleep(LOOK_S)
+    time.sleep(SETTLE_S)
     after = doctor_machine.processor_ticks(proc)
     ticks = (time.monotonic_ns() - started_ns) / 1e9 * os.sysconf("SC_CLK_TCK")
     return doctor_machine.busy_programs(before, after, ticks, os.getpid())
 
 
 def _rights(
-    root: Path, artifacts: Artifacts | None, power: PowerPlan | None, robot: RobotConfig | None, whom: Whom
+    root: Path, artifacts: Artifacts | None, power: PowerPlan | None, robot: RobotConfig | None, user: UserRights
 ) -> Iterator[Check]:
     if artifacts is None:
         yield skipped("real-time priority", "no artifacts")
         yield skipped("device nodes", "no artifacts")
     else:
-        yield doctor_rights.real_time(artifacts.runtime.control_priority, whom)
+        yield doctor_rights.real_time(artifacts.runtime.control_priority, user)
         providers = sorted({graph.session.provider for graph in artifacts.graphs.values()})
-        yield doctor_rights.device_access(providers, root, whom)
-    yield doctor_rights.locked_memory(resource.getrlimit(resource.RLIMIT_MEMLOCK)[0], whom)
+        yield doctor_rights.device_access(providers, root, user)
+    yield doctor_rights.locked_memory(resource.getrlimit(resource.RLIMIT_MEMLOCK)[0], user)
     if robot is not None:
-        yield doctor_rights.socket_folder(robot.bridge.socket, whom)
+        yield doctor_rights.socket_folder(robot.bridge.socket, user)
     kind, rail = ("auto", None) if power is None else (power.meter, power.rail)
     sysfs = root / "sys"
-    yield doctor_rights.power_meter(kind, lambda: open_meter(kind, sysfs_root=sysfs, rail=rail), sysfs, whom)
+    yield doctor_rights.power_meter(kind, lambda: open_meter(kind, sysfs_root=sysfs, rail=rail), sysfs, user)
     yield doctor_rights.temperatures(root / "sys", time.monotonic_ns())
 
 
@@ -274,7 +264,7 @@ def _tick(args: argparse.Namespace, artifacts: Artifacts, plan: PlanFacts | None
             artifacts, args.ticks, TICK_BUDGET_S, min(prompt, artifacts.runtime.max_context)
         )
     except (ArtifactError, GraphError) as error:
-        return Check("tick", Level.FAIL, str(error), "a tick that runs", "edge-export verify DIR says what is wrong")
+        return Check("tick", Level.FAIL, str(error), "a tick that runs", "edge-export verify DIR names what is wrong")
     return doctor_graphs.judge_ticks(times_ms, plan, artifacts.runtime.tick_period_ms)
 
 

@@ -111,9 +111,9 @@ def profile_graph(artifacts: Artifacts, name: str) -> Check:
             events = json.loads(Path(session.end_profiling()).read_text(encoding="utf-8"))
             return judge_placement(name, wanted, placements(events))
         except Exception as error:  # noqa: BLE001 - ONNX Runtime raises whatever its providers do; that is the finding
-            said = (str(error).splitlines() or [type(error).__name__])[0]
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
             advice = "verify the artifacts (edge-export verify), then the provider's packages"
-            return Check(f"provider of {name}", Level.FAIL, f"does not run: {said}", wanted, advice)
+            return Check(f"provider of {name}", Level.FAIL, f"does not run: {reason}", wanted, advice)
 
 
 def example_feeds(artifacts: Artifacts, contract: GraphContract) -> dict[str, Array]:

@@ -11,13 +11,14 @@ from typing import Final
 
 from edge.artifacts.target_facts import GIB, PlanFacts, TargetFacts
 from edge.core.device import DeviceError, check_power_mode, l4t_release
+from edge.core.sysfs import read_int
 from edge.deploy.doctor.check import Check, Level, skipped
 from edge.flightlog.recorder import ARMING_FREE_SHARE
 
 SPARE_MEMORY: Final = 1.2
-"""Free memory as a multiple of the plan's need below which the operator is told."""
+"""Free memory as a multiple of the plan's need; less is a warning."""
 BUSY_CORES: Final = 0.5
-"""Cores that other programs may use together before the operator is told."""
+"""Cores that other programs may use together; more is a warning."""
 STEADY_GOVERNORS: Final = ("performance",)
 _COARSE_CLOCKS: Final = ("jiffies", "acpi_pm", "hpet", "refined-jiffies")
 _GPU_NAMES: Final = ("ga10b", "gpu")
@@ -46,34 +47,29 @@ def _text(path: Path) -> str:
         return ""
 
 
-def _number(path: Path) -> int | None:
-    text = _text(path)
-    return int(text) if text.isascii() and text.isdigit() else None
-
-
 def power_mode(wanted: str, root: Path, query: Query) -> Check:
     """The board's power mode by name, and that it has really been taken: `nvpmodel -q` may name one that was not."""
     name = "power mode"
     conf = _text(root / "etc/nvpmodel.conf")
     if not conf:
         return skipped(name, "no /etc/nvpmodel.conf, so this is no Jetson")
-    said = query()
-    if said is None:
+    answer = query()
+    if answer is None:
         return Check(name, Level.FAIL, "nvpmodel -q does not answer", wanted, "run it by hand: nvpmodel -q")
     try:
-        check_power_mode(wanted, conf=conf, query=said)
+        check_power_mode(wanted, conf=conf, query=answer)
     except DeviceError as error:
         problem, _, advice = str(error).partition(": ")
         return Check(name, Level.FAIL, problem, wanted, advice)
     asked, online = mode_cores(conf, wanted), core_numbers(_text(root / "sys/devices/system/cpu/online"))
     if asked and online and asked != online:
-        found = f"nvpmodel says {wanted}, but cores {_listed(online)} are online"
+        found = f"nvpmodel reports {wanted}, but cores {_listed(online)} are online"
         return Check(name, Level.FAIL, found, f"cores {_listed(asked)}", "reboot: this mode is taken at start-up only")
     return Check(name, Level.OK, wanted, wanted)
 
 
 def mode_cores(conf: str, mode: str) -> set[int]:
-    """Processor cores that a mode of an nvpmodel configuration has online; empty if it does not say."""
+    """Processor cores that a mode of an nvpmodel configuration has online; empty if it names none."""
     block = re.search(rf"<\s*POWER_MODEL\s+ID=\d+\s+NAME={re.escape(mode)}\s*>([^<]*)", conf)
     entries = re.findall(r"^\s*CPU_ONLINE\s+CORE_(\d+)\s+([01])\s*$", block[1] if block else "", re.MULTILINE)
     return {int(core) for core, on in entries if on == "1"}
@@ -113,7 +109,7 @@ def clocks(root: Path) -> Check:
     parts: list[str] = []
     capped = falling = False
     policies = sorted((root / "sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq"))
-    most = [(_number(path / "scaling_max_freq"), _number(path / "cpuinfo_max_freq")) for path in policies]
+    most = [(read_int(path / "scaling_max_freq"), read_int(path / "cpuinfo_max_freq")) for path in policies]
     known = [(now, can) for now, can in most if now is not None and can is not None]
     if known:
         now, can = min(now for now, _ in known), max(can for _, can in known)
@@ -121,7 +117,7 @@ def clocks(root: Path) -> Check:
         parts.append(f"CPU at most {now / 1000:.0f} of {can / 1000:.0f} MHz")
     for path in sorted((root / "sys/class/devfreq").glob("*")):
         label = _text(path / "device/of_node/name") or path.name.partition(".")[2]
-        low, high, cur = (_number(path / f"{key}_freq") for key in ("min", "max", "cur"))
+        low, high, cur = (read_int(path / f"{key}_freq") for key in ("min", "max", "cur"))
         if label not in _GPU_NAMES or low is None or high is None:
             continue
         falling = low < high
@@ -133,7 +129,7 @@ def clocks(root: Path) -> Check:
     if falling:
         advice = "sudo jetson_clocks, else the first tick after a pause runs at the lowest clock"
         return Check(name, Level.WARN, "; ".join(parts), "a GPU clock that does not fall", advice)
-    # A power mode is such a cap: its name has been checked, the figures are told.
+    # A power mode is such a cap: its name has been checked, the figures are shown.
     return Check(name, Level.OK, "; ".join(parts), "no cap" if not capped else "the power mode's cap")
 
 
@@ -176,7 +172,7 @@ class _Size:
 
 def _size(facts: TargetFacts, root: Path) -> _Size:
     """What cannot be read is not compared; a card's own memory is not compared with the machine's."""
-    # Those of the silicon: a power mode takes some away, which is looked at apart.
+    # Those of the silicon: a power mode takes some away, which is another check.
     cores = len(core_numbers(_text(root / "sys/devices/system/cpu/present")))
     total = re.search(r"^MemTotal:\s+(\d+) kB$", _text(root / "proc/meminfo"), re.MULTILINE)
     compatible = _text(root / "proc/device-tree/compatible").split("\0")
@@ -204,20 +200,20 @@ def memory(plan: PlanFacts | None, root: Path, *, own_memory: bool = False) -> C
         return skipped(name, "the artifacts have no plan")
     found = re.search(r"^MemAvailable:\s+(\d+) kB$", _text(root / "proc/meminfo"), re.MULTILINE)
     if found is None:
-        return skipped(name, "/proc/meminfo does not say what is available")
+        return skipped(name, "/proc/meminfo has no MemAvailable")
     free, need = int(found[1]) * 1024, plan.memory_bytes
     if own_memory:
         return skipped(
             name,
             f"the plan's {need / GIB:.2f} GiB are the graphics card's own; {free / GIB:.2f} GiB are free beside it",
         )
-    said, expected = f"{free / GIB:.2f} GiB available", f"{need / GIB:.2f} GiB by the plan"
+    text, expected = f"{free / GIB:.2f} GiB available", f"{need / GIB:.2f} GiB by the plan"
     advice = "end other programs (see busy programs), or export with a smaller precision"
     if free < need:
-        return Check(name, Level.FAIL, said, expected, advice)
+        return Check(name, Level.FAIL, text, expected, advice)
     if free < SPARE_MEMORY * need:
-        return Check(name, Level.WARN, said, f"{expected}, and a fifth to spare", advice)
-    return Check(name, Level.OK, said, expected)
+        return Check(name, Level.WARN, text, f"{expected}, and a fifth to spare", advice)
+    return Check(name, Level.OK, text, expected)
 
 
 def disk(folder: Path, usage: Callable[[Path], tuple[int, int]]) -> Check:
@@ -264,10 +260,10 @@ def processor_ticks(proc: Path) -> dict[int, tuple[str, int]]:
 def busy_programs(
     before: Mapping[int, tuple[str, int]], after: Mapping[int, tuple[str, int]], elapsed_ticks: float, own: int
 ) -> Check:
-    """Who else uses the processor, from two readings of `processor_ticks`."""
+    """Other programs that use the processor, from two readings of `processor_ticks`."""
     name = "busy programs"
     if elapsed_ticks <= 0:
-        return skipped(name, "no time passed between two looks")
+        return skipped(name, "no time passed between two readings")
     cores = {
         (program, pid): (ticks - before[pid][1]) / elapsed_ticks
         for pid, (program, ticks) in after.items()

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
+import os
+import pwd
 import resource
 import stat
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from edge.artifacts.providers import device_nodes
 from edge.deploy.doctor.check import Check, Level, skipped
-from edge.deploy.doctor.user import Whom
-from edge.deploy.service_users import RUNNER_USER
+from edge.deploy.unit_text import RUNNER_USER
 from edge.deploy.units import NEED_DEVICES
 from edge.inference.scheduling import Role, enter
 from edge.power.governor.limits import LimitsConfig
 from edge.power.meters.meter import MeterError, PowerMeter, PowerSample
 from edge.power.meters.rapl import ZONES
 from edge.power.meters.thermal import ThermalReader
-from firmware_bridge.core.config import OPERATOR_SUFFIX
+from firmware_bridge.core.config import OPERATOR_SUFFIX, ConfigError
 
 FROM_UNIT = "the service gets it from its unit (edge-install units)"
 SHARED_FOLDER_MODE = 0o711
@@ -28,8 +30,66 @@ _SETTLE_S = 0.2
 """Between opening a meter and reading it: one that counts energy needs some."""
 
 
+@dataclass(frozen=True)
+class UserRights:
+    """A user of this machine: one's own rights can be tried, another user's are read from the modes of files."""
+
+    name: str
+    uid: int
+    groups: frozenset[int]
+    other: bool
+    """Not the user that runs this: nothing can be tried, only read."""
+
+    def may(self, path: Path, *, write: bool = False) -> bool:
+        """Whether the user may read (and write) a file: by owner, groups and mode, without access lists for another."""
+        if not self.other:
+            return os.access(path, os.R_OK | os.W_OK if write else os.R_OK)
+        if self.uid == 0:
+            return True
+        try:
+            found = path.stat()
+        except OSError:
+            return False
+        wanted = stat.S_IROTH | (stat.S_IWOTH if write else 0)
+        # The first class that fits decides, as in the kernel.
+        shift = 6 if found.st_uid == self.uid else 3 if found.st_gid in self.groups else 0
+        return (stat.S_IMODE(found.st_mode) >> shift) & wanted == wanted
+
+    def through_its_group(self, path: Path) -> bool:
+        """Whether the group of a file may read it, so that membership would do."""
+        try:
+            return path.stat().st_mode & stat.S_IRGRP != 0
+        except OSError:
+            return False
+
+
+def current_user(euid: Callable[[], int] = os.geteuid) -> UserRights:
+    """The user that runs this process."""
+    uid = euid()
+    try:
+        name = pwd.getpwuid(uid).pw_name
+    except KeyError:
+        name = str(uid)
+    return UserRights(name, uid, frozenset({os.getegid(), *os.getgroups()}), other=False)
+
+
+def user_named(name: str | None) -> UserRights:
+    """Return that user, by default the one of this process. Raises ConfigError for an unknown user."""
+    if name is None:
+        return current_user()
+    try:
+        entry = pwd.getpwnam(name)
+    except KeyError:
+        raise ConfigError(
+            f"--user {name}: this machine has no such user; make it first (systemd-sysusers, see edge-install units)"
+        ) from None
+    if entry.pw_uid == os.geteuid():
+        return current_user()
+    return UserRights(name, entry.pw_uid, frozenset(os.getgrouplist(name, entry.pw_gid)), other=True)
+
+
 def try_priority(priority: int) -> list[str]:
-    """Ask for real time in a thread that then ends; lines that say what was refused."""
+    """Ask for real time in a thread that then ends; lines about what was refused."""
     lines: list[str] = []
     thread = threading.Thread(target=lambda: lines.extend(enter(Role("control", (), priority))))
     thread.start()
@@ -37,29 +97,29 @@ def try_priority(priority: int) -> list[str]:
     return lines
 
 
-def real_time(priority: int, whom: Whom, attempt: Callable[[int], list[str]] = try_priority) -> Check:
+def real_time(priority: int, user: UserRights, attempt: Callable[[int], list[str]] = try_priority) -> Check:
     """Whether the control thread would get the real-time priority that the target gives it."""
     name = "real-time priority"
     if priority == 0:
         return skipped(name, "the target asks for none")
-    if whom.other:
-        return skipped(name, f"cannot be tried for {whom.name}; {FROM_UNIT}")
+    if user.other:
+        return skipped(name, f"cannot be tried for {user.name}; {FROM_UNIT}")
     if attempt(priority):
-        return Check(name, Level.WARN, f"refused to {whom.name}", f"SCHED_FIFO {priority}", FROM_UNIT)
-    return Check(name, Level.OK, f"SCHED_FIFO {priority} granted to {whom.name}", f"SCHED_FIFO {priority}")
+        return Check(name, Level.WARN, f"refused to {user.name}", f"SCHED_FIFO {priority}", FROM_UNIT)
+    return Check(name, Level.OK, f"SCHED_FIFO {priority} granted to {user.name}", f"SCHED_FIFO {priority}")
 
 
-def locked_memory(limit_bytes: int, whom: Whom) -> Check:
+def locked_memory(limit_bytes: int, user: UserRights) -> Check:
     """Whether the runner may keep its pages in memory."""
     name = "locked memory"
-    if whom.other and whom.uid != 0:
-        return skipped(name, f"cannot be tried for {whom.name}; {FROM_UNIT}")
-    if limit_bytes == resource.RLIM_INFINITY or whom.uid == 0:
-        return Check(name, Level.OK, f"no limit for {whom.name}", "no limit")
-    return Check(name, Level.WARN, f"at most {limit_bytes // 1024} KiB for {whom.name}", "no limit", FROM_UNIT)
+    if user.other and user.uid != 0:
+        return skipped(name, f"cannot be tried for {user.name}; {FROM_UNIT}")
+    if limit_bytes == resource.RLIM_INFINITY or user.uid == 0:
+        return Check(name, Level.OK, f"no limit for {user.name}", "no limit")
+    return Check(name, Level.WARN, f"at most {limit_bytes // 1024} KiB for {user.name}", "no limit", FROM_UNIT)
 
 
-def device_access(providers: Sequence[str], root: Path, whom: Whom) -> Check:
+def device_access(providers: Sequence[str], root: Path, user: UserRights) -> Check:
     """Whether the providers' device nodes are there and the user may open them."""
     name = "device nodes"
     if not set(providers) & set(NEED_DEVICES):
@@ -68,23 +128,23 @@ def device_access(providers: Sequence[str], root: Path, whom: Whom) -> Check:
     if not nodes:
         return Check(name, Level.FAIL, "none", "those of " + ", ".join(providers), "install the device's driver")
     files = {node: root / node.path.relative_to("/") for node in nodes}
-    closed = [node for node in nodes if not whom.may(files[node], write=_is_for_writing(files[node]))]
+    closed = [node for node in nodes if not user.may(files[node], write=_is_for_writing(files[node]))]
     if closed:
         groups = sorted({node.group for node in closed if node.group}) or ["video", "render"]
-        found = f"{closed[0].path} and {len(closed) - 1} more are closed to {whom.name}"
-        advice = f"sudo usermod -aG {','.join(groups)} {whom.name}, then log in again"
-        if whom.other and all(node.group and whom.through_its_group(files[node]) for node in closed):
+        found = f"{closed[0].path} and {len(closed) - 1} more are closed to {user.name}"
+        advice = f"sudo usermod -aG {','.join(groups)} {user.name}, then log in again"
+        if user.other and all(node.group and user.through_its_group(files[node]) for node in closed):
             return Check(name, Level.WARN, found, "all open", f"{FROM_UNIT}; without it: {advice}")
         return Check(name, Level.FAIL, found, "all open", advice)
-    return Check(name, Level.OK, f"{len(nodes)} found, all open to {whom.name}", "all open")
+    return Check(name, Level.OK, f"{len(nodes)} found, all open to {user.name}", "all open")
 
 
 def _is_for_writing(node: Path) -> bool:
-    """Whether the driver lets anybody but root write; /dev/nvmap of an Orin is read-only (NVIDIA/NemoClaw #4231)."""
+    """Whether not only root may write; /dev/nvmap of an Orin is read-only (NVIDIA/NemoClaw #4231)."""
     return stat.S_IMODE(node.stat().st_mode) & (stat.S_IWGRP | stat.S_IWOTH) != 0
 
 
-def socket_folder(socket: Path, whom: Whom) -> Check:
+def socket_folder(socket: Path, user: UserRights) -> Check:
     """That only the robot's users can reach the bridge's sockets: one user alone, or the service's groups."""
     name = "socket folder"
     folder = socket.parent
@@ -93,19 +153,19 @@ def socket_folder(socket: Path, whom: Whom) -> Check:
     except OSError as error:
         return skipped(name, f"{folder}: {error.strerror}; edge-bridge makes it")
     mode = stat.S_IMODE(found.st_mode)
-    said = f"{folder}, mode {mode:04o}, user {found.st_uid}"
+    text = f"{folder}, mode {mode:04o}, user {found.st_uid}"
     if mode == SHARED_FOLDER_MODE:
-        return _service_sockets(socket, whom, found.st_uid)
+        return _service_sockets(socket, user, found.st_uid)
     if mode & 0o077:
-        expected, advice = "mode 0700, or 0711 of the service", f"chmod 0700 {folder}: anybody could command the robot"
-        return Check(name, Level.FAIL, said, expected, advice)
-    if found.st_uid != whom.uid and whom.uid != 0:
-        expected = f"user {whom.uid} ({whom.name})"
-        return Check(name, Level.FAIL, said, expected, "run bridge and runner as one user, or name it with --user")
-    return Check(name, Level.OK, f"{said} ({whom.name})", "mode 0700")
+        expected, advice = "mode 0700, or 0711 of the service", f"chmod 0700 {folder}: any user could command the robot"
+        return Check(name, Level.FAIL, text, expected, advice)
+    if found.st_uid != user.uid and user.uid != 0:
+        expected = f"user {user.uid} ({user.name})"
+        return Check(name, Level.FAIL, text, expected, "run bridge and runner as one user, or name it with --user")
+    return Check(name, Level.OK, f"{text} ({user.name})", "mode 0700")
 
 
-def _service_sockets(socket: Path, whom: Whom, bridge_uid: int) -> Check:
+def _service_sockets(socket: Path, user: UserRights, bridge_uid: int) -> Check:
     """Modes and groups of the installed service's two sockets, as the runner meets them."""
     name = "bridge sockets"
     operator = Path(f"{socket}{OPERATOR_SUFFIX}")
@@ -113,34 +173,34 @@ def _service_sockets(socket: Path, whom: Whom, bridge_uid: int) -> Check:
         commands, stops = socket.stat(), operator.stat()
     except OSError as error:
         return skipped(name, f"{error.filename}: {error.strerror}; start the bridge, which makes it")
-    said = f"{socket} of group {commands.st_gid}, {operator.name} of group {stops.st_gid}"
+    text = f"{socket} of group {commands.st_gid}, {operator.name} of group {stops.st_gid}"
     for path, status in ((socket, commands), (operator, stops)):
         if stat.S_IMODE(status.st_mode) & 0o007:
             found = f"{path}, mode {stat.S_IMODE(status.st_mode):04o}"
             return Check(name, Level.FAIL, found, "mode 0660 or less", "restart the bridge, which sets the modes")
-    if whom.uid == 0:
-        return Check(name, Level.OK, f"{said}; closed to other users", "mode 0660")
-    if whom.uid == bridge_uid or stops.st_gid in whom.groups:
+    if user.uid == 0:
+        return Check(name, Level.OK, f"{text}; closed to other users", "mode 0660")
+    if user.uid == bridge_uid or stops.st_gid in user.groups:
         advice = (
             "run the runner as a user of its own, outside the operators' group: it could take back an emergency stop"
         )
-        return Check(name, Level.FAIL, f"{whom.name} reaches {operator}", "a runner that cannot operate", advice)
-    if commands.st_gid not in whom.groups:
+        return Check(name, Level.FAIL, f"{user.name} reaches {operator}", "a runner that cannot operate", advice)
+    if commands.st_gid not in user.groups:
         advice = f"name the runner's user with --user (edge-install units: {RUNNER_USER})"
-        return Check(name, Level.FAIL, f"{whom.name} does not reach {socket}", "the runner's user", advice)
-    return Check(name, Level.OK, f"{said}; {whom.name} reaches the first only", "the command socket only")
+        return Check(name, Level.FAIL, f"{user.name} does not reach {socket}", "the runner's user", advice)
+    return Check(name, Level.OK, f"{text}; {user.name} reaches the first only", "the command socket only")
 
 
 def power_meter(
     kind: str,
     open_it: Callable[[], PowerMeter],
     sysfs_root: Path,
-    whom: Whom,
+    user: UserRights,
     *,
     clock: Callable[[], int] = time.monotonic_ns,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Check:
-    """Whether the meter that the target names can be read, and what it says."""
+    """Whether the meter that the target names can be read, and its reading."""
     name = "power meter"
     if kind in ("none", "modelled"):
         return skipped(name, f"the target's meter is {kind!r}")
@@ -153,10 +213,10 @@ def power_meter(
         return Check(name, Level.WARN, str(error), kind, advice)
     found = f"{sample.total_w:.1f} W, {meter.source}, {sample.tagged}"
     # Of all that a meter reads, only these are commonly closed to everybody but root.
-    counters = sorted(sysfs_root.glob(f"{ZONES}/energy_uj")) if whom.other and meter.source.startswith("rapl") else []
-    if closed := [path for path in counters if not whom.may(path)]:
+    counters = sorted(sysfs_root.glob(f"{ZONES}/energy_uj")) if user.other and meter.source.startswith("rapl") else []
+    if closed := [path for path in counters if not user.may(path)]:
         advice = f"for this boot: sudo chmod a+r {closed[0]}, and the others like it (a side channel, CVE-2020-8694)"
-        return Check(name, Level.WARN, f"{closed[0]} is closed to {whom.name}", kind, advice)
+        return Check(name, Level.WARN, f"{closed[0]} is closed to {user.name}", kind, advice)
     return Check(name, Level.OK, found + (f" ({meter.caveat})" if meter.caveat else ""), kind)
 
 

@@ -19,10 +19,10 @@ from edge.core.cli import (
     EXIT_BAD_INPUT,
     EXIT_CHECK_FAILED,
     EXIT_DONE,
-    EXIT_INTERRUPTED,
     EXIT_REFUSED,
     check_result_target,
     command_line,
+    messages,
     write_result,
 )
 from edge.core.stats import percentiles
@@ -45,8 +45,8 @@ input, 3 refused (artifacts), 130 interrupted
 """
 
 LEAST_SHARE = 0.9
-"""Of the ticks with a plan that must have been run again: agreement of a few says nothing of the run."""
-_SAY_EVERY_NS = 2_000_000_000
+"""Of the ticks with a plan that must have been run again: agreement of a few proves nothing about the run."""
+_PROGRESS_PERIOD_NS = 2_000_000_000
 
 
 class OptionError(ValueError):
@@ -90,13 +90,7 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
-def _say(line: str) -> None:
-    sys.stderr.write(f"edge-replay: {line}\n")
-    sys.stderr.flush()
-
-
-class _RefusedError(RuntimeError):
-    """Other artifacts than those of the run; one line."""
+_print = messages("edge-replay")
 
 
 def replay(path: Path, artifacts: Artifacts, run: RecordedRun, from_s: float, to_s: float) -> tuple[Comparison, int]:
@@ -107,18 +101,18 @@ def replay(path: Path, artifacts: Artifacts, run: RecordedRun, from_s: float, to
         raise RecordingError(f"{path}: holds no /tick record, the run ended before its first control tick")
     to_ns = first_ns + round(to_s * 1e9) if math.isfinite(to_s) else 2**63
     replayer = Replayer(artifacts, policy, language, run, from_ns=first_ns + round(from_s * 1e9), to_ns=to_ns)
-    ticks, said_ns = 0, time.monotonic_ns()
+    ticks, printed_ns = 0, time.monotonic_ns()
     for event in read_events(path):
         replayer.step(event)
         if isinstance(event, RecordedTick):
             ticks += 1
             if event.now_ns > to_ns:
                 break
-            if time.monotonic_ns() - said_ns >= _SAY_EVERY_NS:
-                said_ns = time.monotonic_ns()
+            if time.monotonic_ns() - printed_ns >= _PROGRESS_PERIOD_NS:
+                printed_ns = time.monotonic_ns()
                 found = replayer.comparison
                 at_s = (event.now_ns - first_ns) / 1e9
-                _say(f"at {at_s:.0f} s of the log: {found.ticks} ticks and {found.generations} generations run again")
+                _print(f"at {at_s:.0f} s of the log: {found.ticks} ticks and {found.generations} generations run again")
     return replayer.comparison, ticks
 
 
@@ -181,10 +175,10 @@ def as_result(found: Comparison, ticks: int, beyond: Sequence[str]) -> dict[str,
 
 def table(result: dict[str, Any]) -> str:
     """The result for people."""
-    ticks, thoughts = result["ticks"], result["generations"]
+    ticks, generations = result["ticks"], result["generations"]
     lines = [
         f"ticks        {ticks['compared']} of {ticks['recorded']} run again, {ticks['equal']} equal bit for bit",
-        f"generations  {thoughts['compared']} run again, {thoughts['texts_equal']} texts equal",
+        f"generations  {generations['compared']} run again, {generations['texts_equal']} texts equal",
         f"{'':13}{'median':>12}{'p99':>12}{'max':>12}",
     ]
     for name, key, unit in (
@@ -198,16 +192,16 @@ def table(result: dict[str, Any]) -> str:
         else:
             lines.append(f"{name:13}" + "".join(f"{value:12.4g}" for value in values) + f"  {unit}")
     lines += [f"skipped      {count} x {reason}" for reason, count in result["skipped"].items()]
-    if thoughts["poses_interpolated"]:
-        lines.append(f"note         {thoughts['poses_interpolated']} prompts told past motion from the ticks' poses")
-    if thoughts["ways_from_frames"]:
-        lines.append(f"note         {thoughts['ways_from_frames']} prompts told the way through their frames alone")
+    if generations["poses_interpolated"]:
+        lines.append(f"note         {generations['poses_interpolated']} prompts with past motion from the ticks' poses")
+    if generations["ways_from_frames"]:
+        lines.append(f"note         {generations['ways_from_frames']} prompts with the path through their frames alone")
     lines += [f"beyond       {line}" for line in result["beyond"]]
     return "\n".join(lines) + "\n"
 
 
 def _open(args: argparse.Namespace, run: RecordedRun) -> tuple[Artifacts, bool]:
-    """The artifacts, and whether they are those of the run; raises _RefusedError for others without --force."""
+    """The artifacts, and whether they are those of the run; raises ArtifactError for others without --force."""
     artifacts = load_artifacts(args.artifacts.absolute())
     same = artifacts.manifest_sha256 == run.manifest_sha256
     if not same:
@@ -216,8 +210,8 @@ def _open(args: argparse.Namespace, run: RecordedRun) -> tuple[Artifacts, bool]:
             f"recorded {run.manifest_sha256[:12]}…"
         )
         if not args.force:
-            raise _RefusedError(f"{other}; name those of the run, or compare all the same with --force")
-        _say(other)
+            raise ArtifactError(f"{other}; name those of the run, or compare all the same with --force")
+        _print(other)
     if engines.needed(artifacts):
         folder = args.engines or engines.default_directory(artifacts.directory)
         engines.check(artifacts, folder)
@@ -225,41 +219,40 @@ def _open(args: argparse.Namespace, run: RecordedRun) -> tuple[Artifacts, bool]:
     return artifacts, same
 
 
-@command_line("edge-replay")
+@command_line(
+    "edge-replay",
+    {
+        ArtifactError: EXIT_REFUSED,
+        engines.EngineError: EXIT_REFUSED,
+        RecordingError: EXIT_BAD_INPUT,
+        OptionError: EXIT_BAD_INPUT,
+        OSError: EXIT_BAD_INPUT,
+    },
+)
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
     cv2.setNumThreads(1)
     started_ns = time.monotonic_ns()
-    try:
-        check_result_target(args.json)
-        tolerance = Tolerance(args.tolerance_cm, args.tolerance_deg, args.tolerance_command)
-        if not (0 <= args.from_s < args.to_s):
-            raise OptionError(f"--from {args.from_s:g} --to {args.to_s:g}: expected 0 or more, and --to after --from")
-        run = read_run(args.file)
-        artifacts, same = _open(args, run)
-        found, ticks = replay(args.file, artifacts, run, args.from_s, args.to_s)
-        beyond = verdict(found, tolerance)
-        result = {
-            "file": str(args.file),
-            "parts": len(parts(args.file)),
-            "artifacts": str(args.artifacts),
-            "same_artifacts": same,
-            "mode": run.mode,
-            "tolerance": vars(tolerance),
-            **as_result(found, ticks, beyond),
-            "wall_s": round((time.monotonic_ns() - started_ns) / 1e9, 3),
-        }
-        write_result(args.json, result)
-    except (ArtifactError, engines.EngineError, _RefusedError) as error:
-        _say(str(error))
-        return EXIT_REFUSED
-    except (RecordingError, OptionError, OSError) as error:
-        _say(str(error))
-        return EXIT_BAD_INPUT
-    except KeyboardInterrupt:
-        _say("interrupted")
-        return EXIT_INTERRUPTED
+    check_result_target(args.json)
+    tolerance = Tolerance(args.tolerance_cm, args.tolerance_deg, args.tolerance_command)
+    if not (0 <= args.from_s < args.to_s):
+        raise OptionError(f"--from {args.from_s:g} --to {args.to_s:g}: expected 0 or more, and --to after --from")
+    run = read_run(args.file)
+    artifacts, same = _open(args, run)
+    found, ticks = replay(args.file, artifacts, run, args.from_s, args.to_s)
+    beyond = verdict(found, tolerance)
+    result = {
+        "file": str(args.file),
+        "parts": len(parts(args.file)),
+        "artifacts": str(args.artifacts),
+        "same_artifacts": same,
+        "mode": run.mode,
+        "tolerance": vars(tolerance),
+        **as_result(found, ticks, beyond),
+        "wall_s": round((time.monotonic_ns() - started_ns) / 1e9, 3),
+    }
+    write_result(args.json, result)
     if args.json != "-":
         sys.stdout.write(table(result))
     return EXIT_CHECK_FAILED if beyond else EXIT_DONE

@@ -1,4 +1,4 @@
-"""Run the policy again on what a flight log says it was given, and measure how far its outputs lie apart."""
+"""Run the policy again on the recorded inputs of a flight log, and measure how far its outputs lie apart."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from edge.state.pose_history import PoseHistory, StampedPose
 from edge.state.reasoning_text import parse_waypoints
 from edge.state.ring import EncodedFrame
 from edge.state.semantic import SemanticState
-from firmware_bridge.unitree.client import CameraError
+from firmware_bridge.core.robot_state import CameraError
 
 FRAMES_KEPT_NS = 120_000_000_000
 """How long a picture is kept for a generation that names it: its 9 s of past, its own time, and a release delay."""
 _ANY_AGE_MS = 1.0
-"""Ages are not judged again: the log says which ticks were held."""
+"""Ages are not judged again: the log has the ticks that were held."""
 
 Floats = npt.NDArray[np.float32]
 _Result = TypeVar("_Result")
@@ -40,7 +40,7 @@ _GENERATIONS_KEPT = 3
 
 
 class _SkippedError(Exception):
-    """Something that a record refers to is not in the log; the reason in a few words."""
+    """Something that a record refers to is not in the log; the text is the reason."""
 
 
 @dataclass
@@ -68,7 +68,7 @@ class Comparison:
     poses_interpolated: int = 0
     """Generations whose frames' poses had to be taken from the ticks around them."""
     ways_from_frames: int = 0
-    """Generations of a log that does not say which way the prompt told: it is told through their frames alone."""
+    """Generations of a log without the prompt's path: it is computed from their frames alone."""
     skipped: Counter[str] = field(default_factory=Counter)
     trajectory_cm: list[float] = field(default_factory=list)
     heading_deg: list[float] = field(default_factory=list)
@@ -180,7 +180,7 @@ class Replayer:
         return replayed.state
 
     def _way(self, record: RecordedGeneration, frames: Sequence[EncodedFrame]) -> Way:
-        """As it was told; of a log that does not say, through the frames alone."""
+        """The recorded path; of a log without one, the path through the frames alone."""
         if record.way is not None:
             return record.way
         return way_of((frame.stamp_ns, frame.T_odom_base) for frame in frames)
@@ -239,7 +239,7 @@ class Replayer:
         inputs = ControllerInputs(trajectory, 0.0, 0.0, speed_scale=tick.speed_scale, hold=hold)
         command = self._controller.step(inputs, tick.acted_ns)
         self._command_known = self._command_known or hold is not None
-        # A way back, or a turn to what was said, is of what odometry saw meanwhile, not of the plan.
+        # Backing off and turning follow odometry, not the plan.
         if self._command_known and tick.reason not in MOVING:
             apart = np.subtract((command.vx_mps, command.vy_mps, command.wz_radps), tick.command)
             self.comparison.command.append(float(np.abs(apart).max()))

@@ -36,7 +36,7 @@ class RecordedRun:
     mode: str
     manifest_sha256: str
     limits: LimitsConfig | None
-    """None: a log that does not say, so that commands cannot be computed again."""
+    """None: a log without limits, so that commands cannot be computed again."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class RecordedFrame:
 
 @dataclass(frozen=True)
 class RecordedGeneration:
-    """What a generation was given and what it said."""
+    """Inputs and text of a generation."""
 
     number: int
     ready_ns: int
@@ -57,10 +57,10 @@ class RecordedGeneration:
     """None: the run's."""
     frames_ns: tuple[int, ...]
     poses: tuple[SE2, ...] | None
-    """`T_odom_base` of each frame; None: a log that does not say."""
+    """`T_odom_base` of each frame; None: a log without poses."""
     anchor_pose: SE2
     way: Way | None
-    """As the prompt told it; None: a log from before ways were told."""
+    """The path in the prompt; None: a log from before it was recorded."""
     context: DecodingContext
     max_new_tokens: int
     text: str
@@ -76,7 +76,7 @@ class RecordedTick:
     frame_ns: int | None
     generation: int | None
     delay_s: float
-    """As the policy was told."""
+    """As the policy received it."""
     offset: SE2
     pose: SE2 | None
     state: tuple[float, float, float]
@@ -95,7 +95,7 @@ def read_run(path: Path) -> RecordedRun:
     for topic, _, payload in read_messages(path):
         if topic == "/run":
             return _read(path, "/run", _run, payload)
-    raise RecordingError(f"{path}: no /run record, so nothing says what was run; expected a log of edge-run --record")
+    raise RecordingError(f"{path}: no /run record, so the run is unknown; expected a log of edge-run --record")
 
 
 def read_events(path: Path) -> Iterator[Event]:

@@ -1,17 +1,25 @@
-"""The moving average that the budget is on: each sample weighs as long as it was in force."""
+"""Averages of power in bounded memory, in which each sample weighs as long as it was in force: of the last seconds for
+the budget, and of a whole run for its result."""
 
 from __future__ import annotations
 
 import bisect
+import math
 from collections import deque
 from collections.abc import Callable
+from typing import Final
+
+BIN_W: Final = 0.05
+BINS: Final = 8192
+"""Up to 409.6 W; what is above shares the last bin."""
+_LONGEST_S: Final = 1.0
 
 
 class PowerHistory:
     """Energy of the last seconds, at any rate of samples, with bounded memory.
 
     A sample holds until the next one, but not longer than `hold_s`: a gap beyond that belongs to no sample and is left
-    out of averages. Before the first sample everything is taken to have been as the first sample says.
+    out of averages. Before the first sample the power is taken to be that of the first sample.
     """
 
     def __init__(self, keep_s: float, hold_s: float = 1.0, capacity: int = 4096) -> None:
@@ -87,3 +95,41 @@ class PowerHistory:
         if covered <= 0:
             return None if self._newest is None else self._newest[1]
         return energy / covered
+
+
+class PowerStatistics:
+    """Mean and percentiles of a run: a histogram of power; a sample is in force for at most 1 s."""
+
+    def __init__(self) -> None:
+        self._seconds = [0.0] * BINS
+        self._energy_j = 0.0
+        self._total_s = 0.0
+        self._last: tuple[int, float] | None = None
+
+    def add(self, stamp_ns: int, power_w: float) -> None:
+        """The next sample; one that is not newer than the last is dropped."""
+        if self._last is not None:
+            last_ns, last_w = self._last
+            if stamp_ns <= last_ns:
+                return
+            length_s = min((stamp_ns - last_ns) / 1e9, _LONGEST_S)
+            self._seconds[min(int(last_w / BIN_W), BINS - 1)] += length_s
+            self._energy_j += last_w * length_s
+            self._total_s += length_s
+        self._last = (stamp_ns, power_w)
+
+    @property
+    def mean_w(self) -> float | None:
+        """Mean weighted by time; None before the second sample."""
+        return self._energy_j / self._total_s if self._total_s else None
+
+    def percentile_w(self, share: float) -> float | None:
+        """Power that is not exceeded for that share of the time, rounded up to the bin's end."""
+        if not self._total_s:
+            return None
+        seconds, wanted = 0.0, share * self._total_s
+        for index, length_s in enumerate(self._seconds):
+            seconds += length_s
+            if length_s and (seconds >= wanted or math.isclose(seconds, wanted)):
+                return (index + 1) * BIN_W
+        return BINS * BIN_W

@@ -98,10 +98,8 @@ class GovernorOutputs:
     """Reasoning is off and the rest alone is above the budget."""
     findings: tuple[str, ...] = ()
     """Names of the fault table."""
-    says: str | None = None
-    """One line when something has changed."""
-    base_w: float | None = None
-    rise_w: float | None = None
+    message: str | None = None
+    """One line for the operator when something has changed."""
 
 
 class Governor:
@@ -127,7 +125,7 @@ class Governor:
         self._last: tuple[int, GovernorInputs] | None = None
         self._ended_ns: int | None = None
         self._metered_ns: int | None = None
-        self._told: tuple[int, bool, bool, tuple[str, ...]] = (0, True, False, ())
+        self._reported: tuple[int, bool, bool, tuple[str, ...]] = (0, True, False, ())
 
     def step(self, inputs: GovernorInputs, now_ns: int) -> GovernorOutputs:
         """One step, about ten times a second; any rate and any gap will do."""
@@ -168,9 +166,7 @@ class Governor:
             metered=metered,
             over_budget=over,
             findings=self._limits.findings,
-            says=self._say(level, metered, over, average_w, budget_w),
-            base_w=None if levels is None else levels.base_w,
-            rise_w=None if levels is None else levels.rise_w,
+            message=self._message(level, metered, over, average_w, budget_w),
         )
 
     def _learn(self, inputs: GovernorInputs, now_ns: int) -> None:
@@ -201,7 +197,7 @@ class Governor:
             self._history.add(now_ns, levels.at(share))
 
     def _aim(self, budget_w: float, average_w: float | None, now_ns: int) -> float:
-        """The budget less what experience says that the computed pause lacks."""
+        """The budget less what the computed pause has lacked so far."""
         dt_s = 0.0 if self._last is None else min(1.0, (now_ns - self._last[0]) / 1e9)
         over_w = 0.0 if average_w is None else max(0.0, average_w - budget_w)
         self._trim_w += (over_w * _TRIM_PER_S - self._trim_w / _TRIM_FORGET_S) * dt_s
@@ -215,7 +211,7 @@ class Governor:
         if measured is None:
             return None if model is None else model.generation_s(self._tokens(cap))
         if model is None:
-            # Without a plan nothing says how much of a generation is text: half of a full one.
+            # Without a plan the share of decoding in a generation is unknown: half of a full one.
             return measured[1] * (1 + _SHARES[cap]) / (1 + _SHARES[measured[0]])
         return measured[1] * model.generation_s(self._tokens(cap)) / model.generation_s(self._tokens(measured[0]))
 
@@ -292,16 +288,16 @@ class Governor:
         cap = None if level == 0 else self._tokens(level)
         return ReasoningBudget(pause_s=min(max(pause_s, 0.0), _LONGEST_PAUSE_S), max_new_tokens=cap)
 
-    def _say(
+    def _message(
         self, level: int, metered: bool, over: bool, average_w: float | None, budget_w: float | None
     ) -> str | None:
         state = (level, metered, over, self._limits.findings)
-        if state == self._told:
+        if state == self._reported:
             return None
-        before, self._told = self._told, state
+        before, self._reported = self._reported, state
         parts: list[str] = []
         if state[0] != before[0]:
-            parts.append(f"reasoning: {_WORDS[level]}")
+            parts.append(f"reasoning: {_DESCRIPTIONS[level]}")
         if state[1] != before[1]:
             parts.append("power is metered" if metered else "no power reading: the budget is held by the model")
         if over:
@@ -322,7 +318,7 @@ def _first(fits: Callable[[float], bool], most_s: float) -> float:
     return min(max(wait_s, 0.0), most_s)
 
 
-_WORDS: Final = (
+_DESCRIPTIONS: Final = (
     "as planned",
     "half of the tokens",
     "a quarter of the tokens",

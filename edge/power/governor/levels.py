@@ -25,7 +25,7 @@ class Levels:
 
 
 class LevelEstimator:
-    """Two levels by normalised least mean squares: each sample moves the level that it says something of."""
+    """Two levels by normalised least mean squares: each sample moves the level that it depends on."""
 
     def __init__(self, start: Levels | None) -> None:
         self._start = start

@@ -4,12 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
-
-THERMAL_THROTTLE: Final = "thermal-throttle"
-THERMAL_TRIP: Final = "thermal-trip"
-BATTERY_LOW: Final = "battery-low"
-BATTERY_EMPTY: Final = "battery-empty"
 
 
 @dataclass(frozen=True)
@@ -56,10 +50,10 @@ class HeatAndBattery:
     def findings(self) -> tuple[str, ...]:
         """Names of the fault table for what is there now."""
         found = (
-            (THERMAL_TRIP, self._tripped),
-            (THERMAL_THROTTLE, self._hot_ns is not None),
-            (BATTERY_EMPTY, self._empty),
-            (BATTERY_LOW, self._low),
+            ("thermal-trip", self._tripped),
+            ("thermal-throttle", self._hot_ns is not None),
+            ("battery-empty", self._empty),
+            ("battery-low", self._low),
         )
         return tuple(name for name, there in found if there)
 
@@ -97,13 +91,11 @@ class HeatAndBattery:
         return min(step, self._last_step)
 
     def _update_throttle(self, now_ns: int, throttled: bool, margin_c: float | None) -> None:
-        known = margin_c is not None and math.isfinite(margin_c)
-        if throttled or (known and margin_c is not None and margin_c <= 0):
+        margin_c = margin_c if margin_c is not None and math.isfinite(margin_c) else None
+        if throttled or (margin_c is not None and margin_c <= 0):
             self._hot_ns = now_ns if self._hot_ns is None else self._hot_ns
             self._cool_ns = None
-        elif self._hot_ns is not None and (
-            not known or (margin_c is not None and margin_c >= self._config.throttle_clear_c)
-        ):
+        elif self._hot_ns is not None and (margin_c is None or margin_c >= self._config.throttle_clear_c):
             self._cool_ns = now_ns if self._cool_ns is None else self._cool_ns
             if now_ns - self._cool_ns >= self._config.clear_s * 1e9:
                 self._hot_ns = self._cool_ns = None

@@ -1,4 +1,4 @@
-"""What an artifact directory's manifest says of power: the meter, the budget and the modelled energy of every stage."""
+"""The power plan in a manifest: the meter, the budget and the modelled energy of every stage."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from edge.artifacts.manifest import Artifacts
 from edge.power.meters.meter import MEASURED, MODELLED
 
 STAGES: Final = ("vision_encoder", "action_expert", "prefill", "decode", "semantic_context")
+"""Their units: calls, calls, whole prompts, new tokens, calls."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,6 @@ class PowerModel:
     before_text_s: float
     """A generation without any new token: prefill and semantic context."""
     token_s: float
-    prompt_tokens: int
     tagged: str = MODELLED
 
     def __post_init__(self) -> None:
@@ -121,6 +121,5 @@ def _model(plan: Mapping[str, Any], power: Mapping[str, Any]) -> PowerModel | No
         context_j=joules["semantic_context"],
         before_text_s=(seconds["prefill"] + seconds["semantic_context"]) * slower,
         token_s=seconds["decode"] * slower / tokens if tokens else 0.0,
-        prompt_tokens=int(plan["prompt_tokens"]),
         tagged=MEASURED if measured and idle.get("tag") == MEASURED else MODELLED,
     )

@@ -40,7 +40,7 @@ class Rail:
 
 
 class Ina3221Meter:
-    """All labelled rails; the total is the rail that feeds the module, or without one a sum that says so."""
+    """All labelled rails; the total is the rail that feeds the module, or without one a sum with a caveat."""
 
     def __init__(self, rails: tuple[Rail, ...], rail: str | None = None) -> None:
         """`rail` names the total's rail; one that the board lacks is replaced as above. Raises MeterError."""
@@ -85,12 +85,9 @@ class Ina3221Meter:
                 rails[each.label] = power_w
             elif each.label in self._total:
                 raise MeterError(f"{each.voltage.parent}: {each.label} cannot be read (its volts or its amperes)")
-        total_w = sum(rails[label] for label in self._total)
-        try:
-            # A current that flows back by a bit of the converter is noise around nothing.
-            return PowerSample(now_ns, max(total_w, 0.0), rails, source=self.source)
-        except ValueError as error:
-            raise MeterError(f"{self.source}: {error}") from error
+        # A current that flows back by a bit of the converter is noise around nothing.
+        total_w = max(0.0, sum(rails[label] for label in self._total))
+        return PowerSample(now_ns, total_w, rails, source=self.source)
 
 
 def find_rails(chips: list[Path]) -> tuple[Rail, ...]:

@@ -28,7 +28,7 @@ class NvmlMeter:
 
     @classmethod
     def open(cls, module: Any = None, index: int = 0) -> NvmlMeter:
-        """The card's meter; raises MeterError that says what is missing."""
+        """The card's meter; raises MeterError that names what is missing."""
         if module is None:
             try:
                 module = importlib.import_module("pynvml")
@@ -44,8 +44,6 @@ class NvmlMeter:
         """Power as the driver last averaged it; raises MeterError."""
         try:
             power_w = self._nvml.nvmlDeviceGetPowerUsage(self._handle) / _MILLIWATT_PER_W
-            return PowerSample(now_ns, power_w, {"gpu": power_w}, source=self.source)
         except self._nvml.NVMLError as error:
             raise MeterError(f"{self.source}: gives no power ({error}); on a Jetson the meter is ina3221") from error
-        except ValueError as error:
-            raise MeterError(f"{self.source}: {error}") from error
+        return PowerSample(now_ns, power_w, {"gpu": power_w}, source=self.source)

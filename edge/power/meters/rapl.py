@@ -85,9 +85,6 @@ class RaplMeter:
             for domain in self._domains
         }
         self._last_ns, self._last_uj = now_ns, counts
-        try:
-            total_w = sum(rails[domain.name] for domain in self._packages)
-            self._sample = PowerSample(now_ns, total_w, rails, source=self.source)
-        except ValueError as error:
-            raise MeterError(f"{self.source}: {error}") from error
+        total_w = sum(rails[domain.name] for domain in self._packages)
+        self._sample = PowerSample(now_ns, total_w, rails, source=self.source)
         return self._sample

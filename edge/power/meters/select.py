@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
 from edge.core.sysfs import SYSFS
-from edge.power.meters.battery import BatteryMeter, ReadBattery
 from edge.power.meters.ina3221 import Ina3221Meter
-from edge.power.meters.meter import MeterError, PowerMeter, PowerSample
-from edge.power.meters.modelled import ModelledMeter
+from edge.power.meters.meter import MeterError, ModelledMeter, PowerMeter
 from edge.power.meters.nvml import NvmlMeter
 from edge.power.meters.rapl import RaplMeter
-from edge.power.meters.recorded import ReplayMeter
 
-METERS: Final = ("auto", "ina3221", "nvml", "rapl", "battery", "replay", "modelled", "none")
 AUTO: Final = ("ina3221", "nvml", "rapl")
-"""Never the battery: it feeds the motors too."""
+METERS: Final = ("auto", *AUTO, "modelled", "none")
 
 
 def open_meter(
@@ -28,46 +24,32 @@ def open_meter(
     rail: str | None = None,
     idle_w: float | None = None,
     energy_j: Callable[[], float] | None = None,
-    battery: ReadBattery | None = None,
-    replay: Sequence[PowerSample] | None = None,
     nvml: Any = None,
     now_ns: int | None = None,
 ) -> PowerMeter:
     """The meter of that kind; `auto` takes the first that this device has.
 
     `rail` is the INA3221's total; `idle_w` and `energy_j` are the model's (for `modelled`, and the last resort of
-    `auto`); `battery` and `replay` are the sources of those two; `nvml` stands in for the module pynvml. Raises
-    MeterError that names what was looked for.
+    `auto`); `nvml` stands in for the module pynvml. Raises MeterError that names what was looked for.
     """
-    if kind not in METERS:
-        raise MeterError(f"meter {kind!r} is not known; expected one of: {', '.join(METERS)}")
-    modelled = None if idle_w is None or energy_j is None else ModelledMeter(idle_w, energy_j)
-    if kind == "none":
-        raise MeterError("this target names no power meter: expected one of auto, ina3221, nvml, rapl")
-    if kind == "auto":
-        refused: list[str] = []
-        for name in AUTO:
-            try:
-                return open_meter(name, sysfs_root=sysfs_root, rail=rail, nvml=nvml, now_ns=now_ns)
-            except MeterError as error:
-                refused.append(str(error))
-        if modelled is not None:
-            return modelled
-        raise MeterError(f"no power meter on this device: {'; '.join(refused)}")
     if kind == "ina3221":
         return Ina3221Meter.open(sysfs_root, rail)
     if kind == "nvml":
         return NvmlMeter.open(nvml)
     if kind == "rapl":
         return RaplMeter.open(sysfs_root, time.monotonic_ns() if now_ns is None else now_ns)
-    if kind == "battery":
-        if battery is None:
-            raise MeterError("battery: this robot's link gives no battery readings")
-        return BatteryMeter(battery)
-    if kind == "replay":
-        if replay is None:
-            raise MeterError("replay: no recorded series was given")
-        return ReplayMeter(replay)
-    if modelled is None:
-        raise MeterError("modelled: the plan has no energies, its target lacks power.idle_w or busy_w")
-    return modelled
+    if kind == "none":
+        raise MeterError(f"this target names no power meter: expected one of auto, {', '.join(AUTO)}")
+    if kind not in METERS:
+        raise MeterError(f"meter {kind!r} is not known; expected one of: {', '.join(METERS)}")
+    refused: list[str] = []
+    for name in AUTO if kind == "auto" else ():
+        try:
+            return open_meter(name, sysfs_root=sysfs_root, rail=rail, nvml=nvml, now_ns=now_ns)
+        except MeterError as error:
+            refused.append(str(error))
+    if idle_w is not None and energy_j is not None:
+        return ModelledMeter(idle_w, energy_j)
+    if kind == "auto":
+        raise MeterError(f"no power meter on this device: {'; '.join(refused)}")
+    raise MeterError("modelled: the plan has no energies, its target lacks power.idle_w or busy_w")

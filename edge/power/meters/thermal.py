@@ -1,4 +1,4 @@
-"""Temperatures, and whether the machine holds its clocks back because of them.
+"""Temperatures, and whether the machine holds its clocks back because of them or because of over-current.
 
 Zones are found by `type`, because numbers differ between boards and releases. Distances to the board's own trip points
 matter, not degrees: `passive` is where Linux starts to slow down, `critical` is where it cuts the power.
@@ -12,31 +12,26 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from edge.core.sysfs import SYSFS, read_int, read_text
+from edge.core.sysfs import SYSFS, hwmon_named, read_int, read_text
 
 JUNCTION: Final = ("tj-thermal", "tj-therm", "Tj-therm")
 """Jetson's hottest point, as its own zone; on some carrier boards it is there and reads as nothing."""
 LOWEST_C, HIGHEST_C = -40.0, 150.0
 """A disabled Jetson zone reads -256 °C."""
 LOWEST_TRIP_C: Final = 50.0
-"""A passive trip below it is a user's trip that nobody has set."""
+"""A passive trip below it is a user's trip that is not set."""
 WARNS_ONLY: Final = "hot-surface-alert"
 """Jetson's cooling device that says "do not touch" from a passive trip at 70 °C on, and slows nothing down."""
 # A fan that turns is no throttling, and some boards cap devfreq at rest.
 _THROTTLES = re.compile(r"(.*-throttle-alert|Processor|(thermal-)?cpufreq-(cpu)?\d+)")
-_GPU = (
-    "devices/platform/17000000.gpu",
-    "devices/platform/bus@0/17000000.gpu",
-    "devices/17000000.ga10b",
-    "devices/platform/17000000.ga10b",
-    "devices/platform/gpu.0",
-)
-_DEVFREQ = ("class/devfreq/17000000.gpu", "class/devfreq/17000000.ga10b")
+EVENTS: Final = ("oc1", "oc2", "oc3")
+"""Counters of under-voltage, average over-current and instantaneous over-current."""
+_EVENT_FOLDERS = "devices/platform/**/soctherm-oc-event/hwmon/hwmon*"
 
 
 @dataclass(frozen=True)
 class ThermalState:
-    """One reading; None for what the board does not say."""
+    """One reading; None for what the board does not report."""
 
     stamp_ns: int
     zones_c: Mapping[str, float] = field(default_factory=dict)
@@ -47,10 +42,6 @@ class ThermalState:
     """Degrees below the nearest critical trip point."""
     throttling: tuple[str, ...] = ()
     """What holds clocks back now."""
-    gpu_load: float | None = None
-    """0 to 1."""
-    gpu_hz: int | None = None
-    gpu_max_hz: int | None = None
 
     @property
     def throttled(self) -> bool:
@@ -67,7 +58,7 @@ class _Zone:
 
 
 class ThermalReader:
-    """Reads zones, cooling devices, throttle counters and the GPU's load below a sysfs root."""
+    """Reads zones, cooling devices and throttle counters below a sysfs root."""
 
     def __init__(self, sysfs_root: Path = SYSFS) -> None:
         thermal = sysfs_root / "class/thermal"
@@ -80,8 +71,6 @@ class ThermalReader:
         cpus = sysfs_root / "devices/system/cpu"
         self._counters = sorted(cpus.glob("cpu[0-9]*/thermal_throttle/package_throttle_count"))
         self._counts = {path: read_int(path) for path in self._counters}
-        self._load = next((path for name in _GPU if (path := sysfs_root / name / "load").exists()), None)
-        self._devfreq = next((path for name in _DEVFREQ if (path := sysfs_root / name).is_dir()), None)
 
     def read(self, now_ns: int) -> ThermalState:
         """One reading; what cannot be read is left out, nothing is raised."""
@@ -97,7 +86,6 @@ class ThermalReader:
                 throttle_c.append(zone.passive_c - milli_c / 1e3)
             if zone.critical_c is not None:
                 trip_c.append(zone.critical_c - milli_c / 1e3)
-        load, freq = (None if self._load is None else read_int(self._load)), self._devfreq
         return ThermalState(
             stamp_ns=now_ns,
             zones_c=zones,
@@ -105,9 +93,6 @@ class ThermalReader:
             throttle_margin_c=min(throttle_c, default=None),
             trip_margin_c=min(trip_c, default=None),
             throttling=self._throttling(),
-            gpu_load=None if load is None else min(max(load / 1e3, 0.0), 1.0),
-            gpu_hz=None if freq is None else read_int(freq / "cur_freq"),
-            gpu_max_hz=None if freq is None else read_int(freq / "max_freq"),
         )
 
     def _throttling(self) -> tuple[str, ...]:
@@ -139,3 +124,26 @@ def _bound(zone: Path, trip: str) -> set[str]:
     """Types of the cooling devices that a zone's trip point acts on."""
     files = [path for path in zone.glob("cdev*_trip_point") if read_text(path) == trip]
     return {name for path in files if (name := read_text(zone / path.name.partition("_")[0] / "type")) is not None}
+
+
+class OverCurrentEvents:
+    """Over-current and under-voltage events that a Jetson has throttled for, since this object was made.
+
+    The hardware counts since boot, and one event of thousands is no fault: what matters is how many a run has added.
+    Empty on boards without such counters.
+    """
+
+    def __init__(self, sysfs_root: Path = SYSFS) -> None:
+        folders = hwmon_named(sysfs_root, "soctherm_oc") or sorted(sysfs_root.glob(_EVENT_FOLDERS))
+        self._files = {name: path for f in folders for name in EVENTS if (path := f / f"{name}_event_cnt").exists()}
+        self._last = {name: count for name, path in self._files.items() if (count := read_int(path)) is not None}
+        self._events = dict.fromkeys(self._last, 0)
+
+    def read(self) -> dict[str, int]:
+        """Events so far by counter; a counter that went back was reset and counts from zero."""
+        for name, last in self._last.items():
+            count = read_int(self._files[name])
+            if count is not None:
+                self._events[name] += count - last if count >= last else count
+                self._last[name] = count
+        return dict(self._events)

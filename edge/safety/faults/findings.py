@@ -28,14 +28,14 @@ class Finding:
 class FindingQueue:
     """Findings of other threads (odometry, power), kept until the control thread takes them.
 
-    Nobody waits: appending to and taking from a deque are atomic in CPython. A full queue forgets its oldest entry.
+    No thread waits: appending to and taking from a deque are atomic in CPython. A full queue forgets its oldest entry.
     """
 
     def __init__(self, capacity: int = 256) -> None:
         self._queue: deque[Finding] = deque(maxlen=capacity)
 
     def put(self, findings: tuple[Finding, ...]) -> None:
-        """Add what one step of a monitor has found; any thread."""
+        """Add the findings of one step of a monitor; any thread."""
         self._queue.extend(findings)
 
     def __len__(self) -> int:

@@ -1,4 +1,4 @@
-"""What a row of the fault table is: a fault, what the robot does then, how soon, and the test that makes it happen."""
+"""A row of the fault table: a fault, what the robot does then, how soon, and the test that injects it."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ class Fault:
     bound_ms: int
     """From the fault's effect at our input to zero (or limited) velocity on the wire; 0: it never moves at all."""
     where: str
-    """Who acts: the runner, the bridge, the robot itself, or the start-up checks, which refuse to arm."""
-    says: str
+    """What acts: the runner, the bridge, the robot itself, or the start-up checks, which refuse to arm."""
+    message: str
     """What is wrong, one sentence for the operator."""
     advice: str
     """What to do next, one sentence."""
@@ -58,7 +58,7 @@ class Fault:
     clear_ms: int = 1000
     """An unlatched fault ends when it has not been found for this long."""
     speed_scale: float = 1.0
-    """A limit's share of the speed limit; 1 keeps the speed and only tells the operator."""
+    """A limit's share of the speed limit; 1 keeps the speed and only shows the message."""
     escalation: Escalation | None = None
 
     def __post_init__(self) -> None:
@@ -70,7 +70,7 @@ class Fault:
             raise ValueError(f"fault {self.name}: times must not be negative")
         if not 0 < self.speed_scale <= 1 or (self.action is not Action.LIMIT and self.speed_scale != 1):
             raise ValueError(f"fault {self.name}: expected a speed scale in (0, 1], of a limit only")
-        if not (self.says.endswith(".") and self.advice.endswith(".") and "::" in self.test_id):
+        if not (self.message.endswith(".") and self.advice.endswith(".") and "::" in self.test_id):
             raise ValueError(f"fault {self.name}: expected two sentences and a test id")
 
     @property

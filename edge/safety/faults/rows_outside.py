@@ -183,7 +183,7 @@ START: tuple[Fault, ...] = (
         "provider-partial", 25, Action.STOP, 0, "start",
         "The execution provider takes no part of a graph.",
         "Build the engines again with edge-install engines and read what it says.",
-        "tests/edge/deploy/test_doctor.py::test_one_node_that_fell_back_to_the_processor_fails_and_is_named",
+        "tests/edge/deploy/test_doctor.py::test_only_nodes_that_compute_shapes_may_run_on_the_processor",
     ),
     Fault(
         "artifact-corrupt", 53, Action.STOP, 0, "start",

@@ -82,14 +82,14 @@ INPUTS: tuple[Fault, ...] = (
     ),
     Fault(
         "odometry-frozen", 9, Action.ZERO, 700, _HERE,
-        "The robot is told to move and its pose does not change.",
+        "The robot is commanded to move and its pose does not change.",
         "Check that the robot stands free and that its state is not frozen; a second time within 10 s stops the run.",
         _ROBOT + "a_pose_that_stays_while_the_robot_is_told_to_walk_stops_it_for_a_second",
         escalation=Escalation("odometry-stays-frozen", 2, 10_000),
     ),
     Fault(
         "odometry-stays-frozen", 9, Action.STOP, 700, _HERE,
-        "The robot was told to move twice within 10 s and its pose did not change.",
+        "The robot was commanded to move twice within 10 s and its pose did not change.",
         "Free the robot, or restart it if it is free and its pose stands still, before arming again.",
         _ROBOT + "a_pose_that_stays_for_good_is_tried_twice_and_then_stops_the_run",
     ),
@@ -170,7 +170,7 @@ MODEL: tuple[Fault, ...] = (
     ),
     Fault(
         "output-unsteady", 15, Action.LIMIT, 1000, _HERE,
-        "The action expert keeps changing its mind faster than the robot may follow.",
+        "The action expert's plan changes faster than the robot may follow.",
         "Look at the flight log; the robot drives at half speed.",
         _LOOP + "plans_that_change_sides[output-unsteady]",
         speed_scale=0.5,
@@ -216,7 +216,7 @@ MODEL: tuple[Fault, ...] = (
         "reasoning-hung", 17, Action.STOP, 30_300, _HERE,
         "The reasoning hangs in a call that an interrupt does not end.",
         "The runner ends and its service starts it again; look at the kernel log for the accelerator's driver.",
-        "tests/edge/safety/test_reasoning_watch.py::test_a_call_that_an_interrupt_does_not_end_is_given_up",
+        "tests/edge/safety/test_watchdog.py::test_a_call_that_an_interrupt_does_not_end_is_given_up",
     ),
     Fault(
         "semantic-text-invalid", 19, Action.ZERO, 300, _HERE,

@@ -6,15 +6,14 @@ import math
 import zlib
 from collections import OrderedDict, deque
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
 from edge.core.geometry import SE2
 from edge.core.jpeg import jpeg_size
 from edge.safety.faults.findings import Finding
 from edge.safety.monitors.scene import SceneConfig, SceneMonitor
+from edge.state.frame import Frame
 
 DARK, BRIGHT = 8, 247
 """Of 255: a picture with nearly all values beyond one of these shows nothing."""
@@ -26,22 +25,6 @@ CONTENTS_KEPT = 32
 """Pictures whose content is remembered: the most buffers that a V4L2 driver hands out in turn."""
 SLOW, TOO_SLOW = 0.65, 0.4
 """Shares of the expected pictures in a second; half of them missing must be found although counting is off by one."""
-
-
-class Picture(Protocol):
-    """What the monitor reads of `edge.run.camera.Frame`."""
-
-    @property
-    def stamp_ns(self) -> int:
-        """When it was captured."""
-
-    @property
-    def pixels(self) -> npt.NDArray[np.uint8]:
-        """[1, px, px, 3], RGB."""
-
-    @property
-    def jpeg(self) -> bytes:
-        """The bytes it came from; empty when it did not come as JPEG."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +81,7 @@ class FrameMonitor:
         self._since_ns: int | None = None
         self._arrivals: deque[int] = deque(maxlen=max(4, 4 * round(config.rate_hz)))
 
-    def step(self, picture: Picture | None, T_odom_base: SE2 | None, now_ns: int) -> FrameOutputs:
+    def step(self, picture: Frame | None, T_odom_base: SE2 | None, now_ns: int) -> FrameOutputs:
         """Judge the newest picture at `now_ns`; a picture that was seen before keeps its verdict.
 
         `T_odom_base`: the robot's pose when the picture was captured; None: unknown.
@@ -129,7 +112,7 @@ class FrameMonitor:
         detail = "none yet" if age_ms is None else f"the one that is driven by is {age_ms:.0f} ms old"
         return (Finding("camera-stopped", detail),)
 
-    def _judge(self, picture: Picture, T_odom_base: SE2 | None, now_ns: int, findings: list[Finding]) -> None:
+    def _judge(self, picture: Frame, T_odom_base: SE2 | None, now_ns: int, findings: list[Finding]) -> None:
         late = self._seen_ns is not None and picture.stamp_ns < self._seen_ns
         self._seen_ns = picture.stamp_ns
         self._arrivals.append(now_ns)
@@ -145,8 +128,8 @@ class FrameMonitor:
         if self._usable:
             self._judge_content(picture, T_odom_base)
 
-    def _defect(self, picture: Picture) -> str:
-        """What is wrong with the picture itself, in words; empty when it is good."""
+    def _defect(self, picture: Frame) -> str:
+        """What is wrong with the picture itself, for the operator; empty when it is good."""
         pixels, px = picture.pixels, self._config.image_px
         if pixels.ndim != 4 or pixels.dtype != np.uint8 or (px is not None and pixels.shape != (1, px, px, 3)):
             return f"expected {px}×{px} RGB, found {pixels.dtype}{list(pixels.shape)}"
@@ -167,7 +150,7 @@ class FrameMonitor:
             return "saturated"
         return ""
 
-    def _judge_content(self, picture: Picture, T_odom_base: SE2 | None) -> None:
+    def _judge_content(self, picture: Frame, T_odom_base: SE2 | None) -> None:
         # Every fourth line: whatever moves in a picture moves there too, at a quarter of the cost.
         self._content = zlib.crc32(picture.pixels[0, ::4].tobytes())
         if T_odom_base is not None:

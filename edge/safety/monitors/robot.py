@@ -16,16 +16,12 @@ LINK_WINDOW_NS = 2_000_000_000
 LOSSY = 0.65
 """Share of the state messages: 10 % lost is no fault, half of them is (fault matrix, row 35)."""
 ENOUGH_HZ = 50.0
-"""The rate of `rt/sportmodestate` (protocol facts, 49.5 Hz received): who sends more may lose what is above."""
+"""The rate of `rt/sportmodestate` (protocol facts, 49.5 Hz received): what a robot sends above may be lost."""
 _JUDGE_NS = 250_000_000
 
 
 class Attitude(Protocol):
     """What the monitor reads of the robot's state."""
-
-    @property
-    def received_ns(self) -> int:
-        """When it arrived."""
 
     @property
     def roll_rad(self) -> float:
@@ -52,8 +48,8 @@ class RobotWatchConfig:
 class LinkMonitor:
     """How many of a robot's states are lost, by the gaps between its own stamps; for a robot with a clock.
 
-    Nobody has to know the robot's rate, nor has the link to be good at the start: its period is the shortest that a
-    quarter of its stamps have kept to.
+    The robot's rate need not be known, and the link need not be good at the start: the period is the shortest that a
+    quarter of the stamps have kept to.
     """
 
     def __init__(self) -> None:

@@ -60,7 +60,7 @@ class SceneConfig:
     cell_share: float = 0.25
     """Share of its judged blocks that must change for a cell to count as changed."""
     min_cells: int = 20
-    """Fewer textured cells than this, of 64, say nothing: a blank wall."""
+    """Fewer textured cells than this, of 64, prove nothing: a blank wall."""
     frozen_share: float = 0.2
     """Share of the textured cells. Simulated drives: 0.48 and more change when live; a clock changes below 0.1."""
     overlay_share: float = 0.3

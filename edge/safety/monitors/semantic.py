@@ -8,7 +8,7 @@ from edge.safety.faults.findings import Finding
 from edge.state.semantic import SemanticState
 
 INVALID_IN_A_ROW = 3
-_FAILURES_TOLD = 5
+_MAX_REPORTED_FAILURES = 5
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class SemanticMonitor:
         never given such a text, so it cannot be seen in the state.
         """
         findings: list[Finding] = []
-        for _ in range(min(failed - self._failed, _FAILURES_TOLD)):
+        for _ in range(min(failed - self._failed, _MAX_REPORTED_FAILURES)):
             findings.append(Finding("reasoning-failed", f"{failed} in this run"))
         self._failed = max(self._failed, failed)
         self._count(semantic)
@@ -66,5 +66,5 @@ class SemanticMonitor:
         self._generation = semantic.generation
         if semantic.waypoints is not None:
             self._invalid = 0
-        elif semantic.text_complete:  # a text that the budget cut short says nothing about the model
+        elif semantic.text_complete:  # a text that the budget cut short proves nothing about the model
             self._invalid += 1

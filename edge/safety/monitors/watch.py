@@ -12,11 +12,12 @@ import numpy.typing as npt
 from edge.core.geometry import SE2
 from edge.motion.controller import ControllerConfig
 from edge.safety.faults.findings import Finding, FindingQueue
-from edge.safety.monitors.frame import FrameConfig, FrameMonitor, FrameOutputs, Picture
+from edge.safety.monitors.frame import FrameConfig, FrameMonitor, FrameOutputs
 from edge.safety.monitors.machine import MachineMonitor
 from edge.safety.monitors.output import OutputConfig, OutputMonitor
 from edge.safety.monitors.robot import Attitude, RobotMonitor, RobotWatchConfig
 from edge.safety.monitors.semantic import SemanticConfig, SemanticMonitor
+from edge.state.frame import Frame
 from edge.state.pose_history import StampedPose
 from edge.state.semantic import SemanticState
 
@@ -95,8 +96,8 @@ class Watch:
         self._sources.findings.take()
         self._robot.begin(self._sources.malformed())
 
-    def picture(self, picture: Picture | None, T_odom_base: SE2 | None, now_ns: int) -> bool:
-        """Before the encoder: whether the newest picture may be used. What was found is told by `tick`."""
+    def picture(self, picture: Frame | None, T_odom_base: SE2 | None, now_ns: int) -> bool:
+        """Before the encoder: whether the newest picture may be used. `tick` returns what was found."""
         self._pictures = self._frame.step(picture, T_odom_base, now_ns)
         return self._pictures.usable
 
@@ -105,7 +106,7 @@ class Watch:
         sources = self._sources
         return (*sources.findings.take(), *self._robot.urgent(sources.attitude(), sources.malformed()))
 
-    def standing(self, picture: Picture | None, pose: StampedPose | None, now_ns: int) -> tuple[Finding, ...]:
+    def standing(self, picture: Frame | None, pose: StampedPose | None, now_ns: int) -> tuple[Finding, ...]:
         """Before arming: what was found of the newest picture, the robot and by other threads."""
         self.picture(picture, None if pose is None else pose.T_odom_base, now_ns)
         return (

@@ -1,4 +1,4 @@
-"""The `nano` tokenizer: byte-level BPE trained on the words a navigating robot hears and says.
+"""The `nano` tokenizer: byte-level BPE trained on the words of instructions and reasoning texts.
 
 A word is about one token and a coordinate two, sign and whole metres apart from the tenths, because in so small a model
 every token costs time twice: it is prefilled or decoded, and the action expert reads its keys. `python -m
@@ -9,18 +9,13 @@ not depend on the trainer's version.
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 from tokenizers import AddedToken, Regex, Tokenizer, decoders, models, pre_tokenizers, trainers
 
+from export.core.typed import tomllib
 from export.model.config import PRESETS
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 NANO_TOKENIZER = Path(__file__).with_name("nano_tokenizer.json")
 NANO_WORDS = Path(__file__).with_name("nano_words.toml")
@@ -36,7 +31,7 @@ PIECES = (
 )
 """What a token is at most (the expression is Oniguruma's); every character is in one piece."""
 FARTHEST_M = 30
-"""Whole metres that are one token; farther ones are told in two or three."""
+"""Whole metres that are one token; farther ones take two or three."""
 
 _SPLIT = pre_tokenizers.Sequence(
     [

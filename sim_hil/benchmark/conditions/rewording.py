@@ -13,7 +13,7 @@ import numpy as np
 
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.language.instructions import WordingError, wordings
-from sim_hil.benchmark.language.route import RouteError, tell
+from sim_hil.benchmark.language.route import RouteError, describe_route
 from sim_hil.benchmark.suite.episode import Episode
 from sim_hil.benchmark.suite.robots import route_grid
 from sim_hil.scene.nav_grid import NavGrid
@@ -96,5 +96,5 @@ def _training_wordings(episode: Episode, scene: Scene, grid: NavGrid) -> list[st
     path = grid.path(episode.start[:2], episode.goal_xy)
     if path is None:
         raise RouteError("no path to its goal")
-    route = tell(scene, grid, path, goal)
+    route = describe_route(scene, grid, path, goal)
     return wordings(route, len(episode.instructions), crc32(episode.task.encode()), held_out=False)

@@ -1,9 +1,14 @@
-"""The benchmark as a Gymnasium environment, `DynaNav-v0`: a reset per episode, a step per control period of 0.1 s."""
+"""The benchmark as a Gymnasium environment, `DynaNav-v0`: a reset per episode, a step per control period of 0.1 s.
+
+The reward is the paper's equation 5. The paper names its four terms but does not define them. Our definitions: goal is
+1 in the step that reaches it; progress is the decrease of the path length to the goal around obstacles, m; collision is
+1 in a step in which a collision begins (`Contacts`); speed is the absolute difference from the target speed, m/s.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass, replace
 from math import hypot, isfinite
 from typing import Any, Final
 
@@ -14,7 +19,6 @@ from numpy.typing import NDArray
 
 from edge.core.geometry import SE2
 from sim_hil.benchmark.env.observation import Observation
-from sim_hil.benchmark.env.reward import PAPER, Contacts, RewardWeights, reward
 from sim_hil.benchmark.env.world import EpisodeWorld, WorldOptions
 from sim_hil.benchmark.suite.episode import Episode, load_suite
 from sim_hil.benchmark.suite.robots import robot_grid
@@ -28,7 +32,61 @@ HIGH: Final = (1.5, 0.35, 1.2)
 MAX_GRIDS: Final = 8
 """Maximum number of navigation grids (one per scene and robot) cached between episodes."""
 
+APART_STEPS: Final = 10
+"""Control steps (1 s) without contact after which touching the same object counts as another collision."""
+
 Pictures = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class RewardWeights:
+    """Weights w_g, w_p, w_c and w_s of equation 5, and the target speed, m/s."""
+
+    goal: float = 400.0
+    progress: float = 5.0
+    collision: float = -100.0
+    speed: float = -0.1
+    target_speed_mps: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not all(isfinite(v) for v in (self.goal, self.progress, self.collision, self.speed, self.target_speed_mps)):
+            raise ValueError("reward: every weight must be finite")
+
+
+PAPER = RewardWeights()
+
+
+class Contacts:
+    """Detector of new collisions: repeated contact while scraping along a wall or a person counts once."""
+
+    def __init__(self) -> None:
+        self._step = 0
+        self._touched: dict[str, int] = {}
+
+    def began(self, touching: Set[str]) -> bool:
+        """Return whether a collision begins; call once per control step with the labels of touched objects."""
+        self._step += 1
+        last = {label: self._touched.get(label) for label in touching}
+        self._touched.update(dict.fromkeys(touching, self._step))
+        return any(step is None or self._step - step > APART_STEPS for step in last.values())
+
+
+def reward(
+    *,
+    reached: bool,
+    distance_before_m: float,
+    distance_after_m: float,
+    collision_began: bool,
+    speed_mps: float,
+    weights: RewardWeights = PAPER,
+) -> float:
+    """Return the reward of one control step; distances are path lengths to the goal before and after it, m."""
+    return (
+        weights.goal * float(reached)
+        + weights.progress * (distance_before_m - distance_after_m)
+        + weights.collision * float(collision_began)
+        + weights.speed * abs(speed_mps - weights.target_speed_mps)
+    )
 
 
 class DynaNavEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):

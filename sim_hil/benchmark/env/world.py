@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from math import isfinite
 from typing import TYPE_CHECKING, Final
@@ -11,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.core.geometry import SE2
-from sim_hil.benchmark.env.metrics import FRAME_HZ, is_success
+from sim_hil.benchmark.env.metrics import FRAME_HZ, Outcome, is_success, measure
 from sim_hil.benchmark.env.observation import Observation, Odometer
-from sim_hil.benchmark.env.outcome import Outcome, measure
 from sim_hil.benchmark.suite.episode import Episode
-from sim_hil.robots.interface import BaseTruth, Robot
+from sim_hil.robots.interface import Robot
 from sim_hil.robots.odometry_noise import LEVELS
 from sim_hil.scene.scene import Scene, load_scene
 from sim_hil.simulation.physics import Simulation
@@ -58,7 +56,7 @@ class WorldOptions:
 class EpisodeWorld:
     """World of one episode from its start; the same episode and options give identical results on every machine.
 
-    `on_frame` is called after each 30 Hz frame. Raises SceneError or ValueError if the world cannot be built.
+    Raises SceneError or ValueError if the world cannot be built.
     """
 
     def __init__(
@@ -67,12 +65,10 @@ class EpisodeWorld:
         options: WorldOptions | None = None,
         *,
         scene: Scene | None = None,
-        on_frame: Callable[[EpisodeWorld], None] | None = None,
     ) -> None:
         """Build the world and let the robot settle; `scene` replaces loading the episode's scene by name."""
         self.episode = episode
         self.options = options if options is not None else WorldOptions()
-        self._on_frame = on_frame
         self._camera: CameraWorld | None = None
         self._simulation = Simulation(
             scene if scene is not None else load_scene(episode.scene),
@@ -186,8 +182,6 @@ class EpisodeWorld:
         if self._reached_frame is None and is_success(pose[:2], self.episode.goal_xy, self.episode.threshold_m):
             self._reached_frame = self._frames
         self._end = self._ended()
-        if self._on_frame is not None:
-            self._on_frame(self)
 
     def _ended(self) -> str | None:
         if self._reached_frame is not None:
@@ -203,10 +197,6 @@ class EpisodeWorld:
         if self._end is None:
             self._end = "stopped"
 
-    def truth(self) -> BaseTruth:
-        """Return the robot's ground truth; its `time_s` is simulation time, which began before the episode."""
-        return self._simulation.truth()
-
     def pose(self) -> SE2:
         """Return the robot's true planar pose `T_world_base`."""
         return SE2(*self._trajectory[-1])
@@ -218,10 +208,6 @@ class EpisodeWorld:
     def people_velocities(self) -> Array:
         """Return the velocity of every person [n, 2] in the world frame, m/s."""
         return self._simulation.people_velocities()
-
-    def render_state(self) -> Array:
-        """Return the state that a CameraWorld of the same scene, people and seed renders."""
-        return self._simulation.render_state()
 
     def trajectory(self) -> Array:
         """Return the robot's poses so far at 30 Hz [n, 3]: x m, y m, heading rad; the start included."""

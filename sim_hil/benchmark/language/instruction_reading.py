@@ -103,14 +103,14 @@ def _claim(kind: str, values: dict[str, str | None]) -> Claim:
     )
 
 
-def untrue(text: str, told: RouteDescription) -> list[str]:
+def untrue(text: str, route: RouteDescription) -> list[str]:
     """Return the false or missing claims of an instruction about a route, one line each; empty if it is correct."""
     try:
         claims = read(text)
     except ValueError as error:
         return [str(error)]
     problems: list[str] = []
-    steps = [s for s in told.steps if not (s.side == "straight" and s.kind in ("sidewalk", "corridor", "aisle"))]
+    steps = [s for s in route.steps if not (s.side == "straight" and s.kind in ("sidewalk", "corridor", "aisle"))]
     taken = 0
     for claim in claims:
         if claim.kind in ("turn", "cross"):
@@ -120,16 +120,16 @@ def untrue(text: str, told: RouteDescription) -> list[str]:
             problems += _wrong_step(claim, steps[taken])
             taken += 1
         elif claim.kind == "pass":
-            problems += _wrong_pass(claim, told, steps, taken)
-        elif claim.kind == "leave" and not told.leaves_room:
+            problems += _wrong_pass(claim, route, steps, taken)
+        elif claim.kind == "leave" and not route.leaves_room:
             problems.append("says to leave a room, but the start is in none")
-        elif claim.kind == "end" and not (taken == len(steps) and told.goal_at_end):
+        elif claim.kind == "end" and not (taken == len(steps) and route.goal_at_end):
             problems.append("says to go to the end, but the goal is not there")
         elif claim.kind == "goal":
-            if claim.name not in (told.goal_name, told.goal_bare):
-                problems.append(f"speaks of the {claim.name}, but the goal is the {told.goal_name}")
-            if claim.side and claim.side != told.goal_side:
-                problems.append(f"says that the goal is on the {claim.side}, it is {told.goal_side or 'elsewhere'}")
+            if claim.name not in (route.goal_name, route.goal_bare):
+                problems.append(f"speaks of the {claim.name}, but the goal is the {route.goal_name}")
+            if claim.side and claim.side != route.goal_side:
+                problems.append(f"says that the goal is on the {claim.side}, it is {route.goal_side or 'elsewhere'}")
     if taken < len(steps):
         problems.append(f"leaves out {len(steps) - taken} of {len(steps)} turns")
     if not any(claim.kind == "goal" for claim in claims):
@@ -167,13 +167,13 @@ def _counted_as(kind: str) -> str:
     return "passage" if kind == "sidewalk" else opening_class(kind)
 
 
-def _wrong_pass(claim: Claim, told: RouteDescription, steps: list[Step], taken: int) -> list[str]:
+def _wrong_pass(claim: Claim, route: RouteDescription, steps: list[Step], taken: int) -> list[str]:
     """Check that a landmark is passed on the next segment, or on one that continues straight from it."""
-    stretches = [told.passed] if taken >= len(steps) else [steps[taken].passed]
-    index = told.steps.index(steps[taken]) if taken < len(steps) else len(told.steps)
-    while index > 0 and told.steps[index - 1].side == "straight" and told.steps[index - 1] not in steps:
+    stretches = [route.passed] if taken >= len(steps) else [steps[taken].passed]
+    index = route.steps.index(steps[taken]) if taken < len(steps) else len(route.steps)
+    while index > 0 and route.steps[index - 1].side == "straight" and route.steps[index - 1] not in steps:
         index -= 1
-        stretches.append(told.steps[index].passed)
+        stretches.append(route.steps[index].passed)
     for stretch in stretches:
         for thing in stretch:
             if thing.name == claim.name:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from sim_hil.benchmark.language.route import COLOUR_WORDS
 from sim_hil.scene.scene import KINDS
 
 # Areas that instructions refer to by name instead of by count.
@@ -10,9 +9,10 @@ AREAS = (
     "reception", "waiting area", "service area", "open office", "elevator lobby", "loading area", "main aisle",
     "back aisle", "plaza", "park",
 )  # fmt: skip
+COLOUR_WORDS = frozenset(
+    ("red", "blue", "green", "yellow", "orange", "purple", "white", "black", "brown", "pink", "grey")
+)
 ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth")
 # Names of landmarks: those of all kinds, and additional names used in scenes.
-NOUNS = tuple(
-    sorted({kind.words for kind in KINDS.values()} | {"exit door", "desk", "umbrella"}, key=len, reverse=True)
-)
+NOUNS = tuple(sorted({kind.noun for kind in KINDS.values()} | {"exit door", "desk", "umbrella"}, key=len, reverse=True))
 NAME = rf"\b(?:(?:{'|'.join(sorted(COLOUR_WORDS))}) )?(?:{'|'.join(NOUNS)})\b"

@@ -45,7 +45,7 @@ class _Writer:
         return bool(self.rng.uniform() < share)
 
 
-def wordings(told: RouteDescription, count: int, seed: int, *, held_out: bool) -> list[str]:
+def wordings(route: RouteDescription, count: int, seed: int, *, held_out: bool) -> list[str]:
     """Return `count` different wordings of a route, from the benchmark's patterns (`held_out`) or training's.
 
     Deterministic per seed. Raises WordingError if the grammar does not yield enough.
@@ -54,7 +54,7 @@ def wordings(told: RouteDescription, count: int, seed: int, *, held_out: bool) -
     found: list[str] = []
     patterns: set[str] = set()
     for attempt in range(400 + 60 * count):
-        text = _compose(_Writer(rng), told)
+        text = _compose(_Writer(rng), route)
         if len(text.split()) > MAX_WORDS or is_held_out(text) != held_out or text in found:
             continue
         # Prefer a new pattern for each, because wordings that differ in one word add little.
@@ -64,7 +64,7 @@ def wordings(told: RouteDescription, count: int, seed: int, *, held_out: bool) -
         found.append(text)
         if len(found) == count:
             return found
-    raise WordingError(f"{told.goal_name}: {len(found)} wordings found, {count} wanted")
+    raise WordingError(f"{route.goal_name}: {len(found)} wordings found, {count} wanted")
 
 
 def pattern(text: str) -> str:
@@ -80,9 +80,9 @@ def is_held_out(text: str) -> bool:
     return int.from_bytes(digest[:4], "big") < HELD_OUT_SHARE * 2**32
 
 
-def _compose(w: _Writer, told: RouteDescription) -> str:
-    clauses = _steps(w, told)
-    goal = told.goal_bare if w.chance(0.5) else told.goal_name
+def _compose(w: _Writer, route: RouteDescription) -> str:
+    clauses = _steps(w, route)
+    goal = route.goal_bare if w.chance(0.5) else route.goal_name
     style = w.pick("route", "route", "route", "goal", "short")
     if style == "goal":
         opening = w.pick(
@@ -90,21 +90,21 @@ def _compose(w: _Writer, told: RouteDescription) -> str:
             f"bring yourself to the {goal}", f"head for the {goal}",
         )  # fmt: skip
         end = w.pick("stop there", "stop when you get there", "wait there", f"stop at the {goal}")
-        body = _joined(w, [*clauses, *_last_leg(w, told)])
+        body = _joined(w, [*clauses, *_last_leg(w, route)])
         if not body:
-            body = _straight(w, told.goal_area_kind, told.goal_area_name)
+            body = _straight(w, route.goal_area_kind, route.goal_area_name)
         return _polite(w, f"{opening}{w.pick('. ', ': ')}{body}{w.pick(' and ', ', then ', '. Then ')}{end}")
-    stop = _stop(w, told, goal)
+    stop = _stop(w, route, goal)
     if style == "short":
         parts = [*clauses, w.pick(f"stop at the {goal}", f"stop by the {goal}", f"then the {goal}")]
         return _sentence(
             ", ".join(parts)
             if len(parts) > 1
-            else f"{_straight(w, told.goal_area_kind, told.goal_area_name)}, {parts[0]}"
+            else f"{_straight(w, route.goal_area_kind, route.goal_area_name)}, {parts[0]}"
         )
-    rest = _last_leg(w, told) if w.chance(0.6) else []
+    rest = _last_leg(w, route) if w.chance(0.6) else []
     if not clauses and not rest:
-        rest = [_straight(w, told.goal_area_kind, told.goal_area_name)]
+        rest = [_straight(w, route.goal_area_kind, route.goal_area_name)]
     return _polite(w, f"{_joined(w, [*clauses, *rest])}{w.pick(' and ', ', then ', '. Then ', ', and ')}{stop}")
 
 
@@ -160,24 +160,24 @@ def _pass(w: _Writer, thing: Passed) -> str:
     )  # fmt: skip
 
 
-def _last_leg(w: _Writer, told: RouteDescription) -> list[str]:
+def _last_leg(w: _Writer, route: RouteDescription) -> list[str]:
     """Return the clauses about the route after the last turn."""
     out = []
-    if told.passed and w.chance(0.35):
-        out.append(_pass(w, told.passed[int(w.rng.integers(len(told.passed)))]))
-    elif told.last_m > 3.0 and w.chance(0.5):
-        along = _noun(w, told.goal_area_kind, told.goal_area_name) if told.goal_area_kind in _CORRIDOR else ""
-        if told.goal_at_end and along and w.chance(0.6):
+    if route.passed and w.chance(0.35):
+        out.append(_pass(w, route.passed[int(w.rng.integers(len(route.passed)))]))
+    elif route.last_m > 3.0 and w.chance(0.5):
+        along = _noun(w, route.goal_area_kind, route.goal_area_name) if route.goal_area_kind in _CORRIDOR else ""
+        if route.goal_at_end and along and w.chance(0.6):
             out.append(w.pick(f"go to the end of the {along}", f"follow the {along} to its end"))
-        elif told.goal_area_kind in _CORRIDOR:
-            out.append(_straight(w, told.goal_area_kind, told.goal_area_name))
+        elif route.goal_area_kind in _CORRIDOR:
+            out.append(_straight(w, route.goal_area_kind, route.goal_area_name))
     return out
 
 
-def _stop(w: _Writer, told: RouteDescription, goal: str) -> str:
+def _stop(w: _Writer, route: RouteDescription, goal: str) -> str:
     side = ""
-    if told.goal_side in ("left", "right") and w.chance(0.4):
-        side = w.pick(f" on your {told.goal_side}", f" on the {told.goal_side}")
+    if route.goal_side in ("left", "right") and w.chance(0.4):
+        side = w.pick(f" on your {route.goal_side}", f" on the {route.goal_side}")
     goal += side
     return w.pick(
         f"stop at the {goal}", f"stop in front of the {goal}", f"stop next to the {goal}", f"stop by the {goal}",
@@ -188,10 +188,10 @@ def _stop(w: _Writer, told: RouteDescription, goal: str) -> str:
     )  # fmt: skip
 
 
-def _steps(w: _Writer, told: RouteDescription) -> list[str]:
+def _steps(w: _Writer, route: RouteDescription) -> list[str]:
     out: list[str] = []
-    for index, step in enumerate(told.steps):
-        leave = index == 0 and told.leaves_room
+    for index, step in enumerate(route.steps):
+        leave = index == 0 and route.leaves_room
         if leave:
             out.append(w.pick("leave the room", "go out of the room", "exit the room", "leave this room"))
         elif (passed := [thing for thing in step.passed if thing not in step.near]) and w.chance(0.3):

@@ -1,8 +1,11 @@
-"""Openings along a route, from the geometry: exits of a corridor, aisle or sidewalk to the left or right."""
+"""Geometry of routes: polylines, bounding boxes, and the exits of a corridor, aisle or sidewalk to either side."""
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
+from math import hypot
 
 import numpy as np
 
@@ -14,6 +17,15 @@ _STEP_M = 0.1
 _BODY_M = 0.3  # radius of a body that must fit through an opening
 _BEYOND_M = 0.45
 _SIDEWAYS_M = 1.0  # extent to one side from which a crossed corridor counts as an opening
+
+
+def dense(path: Sequence[Vec2], step_m: float = 0.1) -> list[Vec2]:
+    """Return points along a polyline at most about `step_m` apart, its own points included."""
+    points = [path[0]]
+    for a, b in itertools.pairwise(path):
+        count = max(1, round(hypot(b[0] - a[0], b[1] - a[1]) / step_m))
+        points += [(a[0] + (b[0] - a[0]) * k / count, a[1] + (b[1] - a[1]) * k / count) for k in range(1, count + 1)]
+    return points
 
 
 @dataclass(frozen=True)

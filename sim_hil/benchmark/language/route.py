@@ -10,12 +10,14 @@ import itertools
 from dataclasses import dataclass, replace
 from math import cos, hypot, sin
 
+from sim_hil.benchmark.language.instruction_words import COLOUR_WORDS
 from sim_hil.benchmark.language.openings import (
     LINEAR,
     Bounds,
     Frame,
     Opening,
     bounds_of,
+    dense,
     is_open,
     opening_class,
     side_openings,
@@ -104,7 +106,7 @@ class _Leg:
     kind: str
 
 
-def tell(scene: Scene, grid: NavGrid, path: list[Vec2], goal: SceneObject) -> RouteDescription:
+def describe_route(scene: Scene, grid: NavGrid, path: list[Vec2], goal: SceneObject) -> RouteDescription:
     """Describe a path to a landmark; `grid`: any grid of the scene. Raises RouteError if that is not possible."""
     runs = _runs(scene, path)
     legs = _legs(runs)
@@ -116,7 +118,11 @@ def tell(scene: Scene, grid: NavGrid, path: list[Vec2], goal: SceneObject) -> Ro
     length = sum(hypot(b[0] - a[0], b[1] - a[1]) for a, b in itertools.pairwise(path))
     last_m = hypot(last.end[0] - last.start[0], last.end[1] - last.start[1])
     return RouteDescription(
-        steps=tuple(_without(step, goal.label) for step in steps),
+        # The goal is neither passed nor marks a turn.
+        steps=tuple(
+            replace(step, near=_others(step.near, goal.label), passed=_others(step.passed, goal.label))
+            for step in steps
+        ),
         goal_label=goal.label,
         goal_name=goal.landmark,
         goal_bare=_bare(scene, walked, goal),
@@ -131,23 +137,14 @@ def tell(scene: Scene, grid: NavGrid, path: list[Vec2], goal: SceneObject) -> Ro
     )
 
 
-def _without(step: Step, label: str) -> Step:
-    """Return the step without the goal, which is neither passed nor marks a turn."""
-    return replace(step, near=_others(step.near, label), passed=_others(step.passed, label))
-
-
 def _others(things: tuple[Passed, ...], label: str) -> tuple[Passed, ...]:
     return tuple(thing for thing in things if thing.label != label)
 
 
 def _runs(scene: Scene, path: list[Vec2]) -> list[_Run]:
     """Return the areas along a path, in order, without those of which it only clips a corner."""
-    points = [path[0]]
-    for a, b in itertools.pairwise(path):
-        count = max(1, round(hypot(b[0] - a[0], b[1] - a[1]) / _SAMPLE_M))
-        points += [(a[0] + (b[0] - a[0]) * k / count, a[1] + (b[1] - a[1]) * k / count) for k in range(1, count + 1)]
     runs: list[_Run] = []
-    for point in points:
+    for point in dense(path, _SAMPLE_M):
         area = scene.area_at(*point)
         if area is None:  # a niche between two houses belongs to the previous area
             if not runs:
@@ -392,11 +389,6 @@ def _bare(scene: Scene, walked: list[Area], goal: SceneObject) -> str:
             return goal.landmark
     first, _, rest = goal.landmark.partition(" ")
     return rest if rest and first in COLOUR_WORDS else goal.landmark
-
-
-COLOUR_WORDS = frozenset(
-    ("red", "blue", "green", "yellow", "orange", "purple", "white", "black", "brown", "pink", "grey")
-)  # fmt: skip
 
 
 def _goal_side(leg: _Leg, goal: SceneObject) -> str:

@@ -9,6 +9,7 @@ from math import atan2, degrees, hypot, pi
 import numpy as np
 
 from sim_hil.benchmark.language.instruction_reading import read
+from sim_hil.benchmark.language.openings import dense
 from sim_hil.benchmark.language.route import Passed, RouteDescription
 from sim_hil.benchmark.language.visibility import Sightlines
 from sim_hil.scene.nav_grid import NavGrid
@@ -17,8 +18,10 @@ from sim_hil.scene.scene import Scene, Vec2
 MIN_PIXELS = 40.0  # least size of a landmark in a 128 x 128 image, about 6 x 6 px: colour and shape are visible
 RANGE_INDOORS_M, RANGE_OUTDOORS_M = 12.0, 30.0
 _POSE_M = 0.4
-_STEP_M = 0.1
-_LOOK, _RUN = 22, 6  # steps: a turn lies within 2.2 m of where it is told; directions are taken over 0.6 m
+_LOOK, _RUN = (
+    22,
+    6,
+)  # steps: a turn lies within 2.2 m of its described place; directions are over 0.6 m
 _LEAST_TURN_RAD = pi / 9  # 20 degrees: a shortest path rounds its corners slantwise
 _OPEN = frozenset(("plaza", "yard"))
 
@@ -38,23 +41,21 @@ def poses_along(path: Sequence[Vec2]) -> list[tuple[float, float, float]]:
     return poses
 
 
-def named_landmarks(texts: Sequence[str], told: RouteDescription) -> tuple[str, ...]:
+def named_landmarks(texts: Sequence[str], route: RouteDescription) -> tuple[str, ...]:
     """Return the labels of the landmarks named in any of the texts: first the goal, then in order of the route."""
     names = {claim.name for text in texts for claim in read(text) if claim.name}
     along: list[Passed] = []
-    for step in told.steps:
+    for step in route.steps:
         along += [*step.passed, *step.near]
-    along += told.passed
-    labels = [told.goal_label]
+    along += route.passed
+    labels = [route.goal_label]
     for thing in along:
         if thing.name in names and thing.label not in labels:
             labels.append(thing.label)
     return tuple(labels)
 
 
-def named_too_small(
-    scene: Scene, lines: Sightlines, path: Sequence[Vec2], labels: Sequence[str]
-) -> list[str]:  # fmt: skip
+def named_too_small(scene: Scene, lines: Sightlines, path: Sequence[Vec2], labels: Sequence[str]) -> list[str]:
     """Return the landmarks that never appear large enough in the image along the path, one line each."""
     range_m = RANGE_INDOORS_M if scene.ceiling_height_m > 0 else RANGE_OUTDOORS_M
     poses, found = poses_along(path), []
@@ -63,9 +64,9 @@ def named_too_small(
         if label not in things:
             found.append(f"{label}: no such landmark in the scene")
             continue
-        sight = lines.best(poses, things[label], range_m)
-        if sight.pixels < MIN_PIXELS:
-            found.append(f"{label}: at most {sight.pixels:.0f} px in the picture, {MIN_PIXELS:.0f} expected")
+        pixels = lines.most_pixels(poses, things[label], range_m)
+        if pixels < MIN_PIXELS:
+            found.append(f"{label}: at most {pixels:.0f} px in the picture, {MIN_PIXELS:.0f} expected")
     return found
 
 
@@ -87,34 +88,26 @@ def worst_leak(grid: NavGrid, goal: Vec2, threshold_m: float) -> float:
     return float(np.maximum(worst, 0.0))
 
 
-def wrong_bends(told: RouteDescription, path: Sequence[Vec2]) -> list[str]:
+def wrong_bends(route: RouteDescription, path: Sequence[Vec2]) -> list[str]:
     """Return the described turns at which the path does not bend to that side.
 
     Turns onto a plaza or a yard are not checked, because the path may cross their open borders diagonally.
     """
-    dense = _dense(path)
-    places = [_nearest(dense, step.at) for step in told.steps]
+    points = dense(path)
+    places = [_nearest(points, step.at) for step in route.steps]
     found = []
-    for index, (step, at) in enumerate(zip(told.steps, places, strict=True)):
+    for index, (step, at) in enumerate(zip(route.steps, places, strict=True)):
         if step.side == "straight" or step.kind in _OPEN:
             continue
         # At most half way to the neighbouring turns, which bend the path too.
         first = max(at - _LOOK, (places[index - 1] + at) // 2 if index else 0)
-        last = min(at + _LOOK, (at + places[index + 1]) // 2 if index + 1 < len(places) else len(dense) - 1)
-        before = _minus(dense[min(first + _RUN, at)], dense[first])
-        after = _minus(dense[last], dense[max(last - _RUN, at)])
+        last = min(at + _LOOK, (at + places[index + 1]) // 2 if index + 1 < len(places) else len(points) - 1)
+        before = _minus(points[min(first + _RUN, at)], points[first])
+        after = _minus(points[last], points[max(last - _RUN, at)])
         bend = (atan2(after[1], after[0]) - atan2(before[1], before[0]) + pi) % (2 * pi) - pi
         if (bend > 0) != (step.side == "left") or abs(bend) < _LEAST_TURN_RAD:
             found.append(f"turn {step.side} into the {step.name}: the path bends by {degrees(bend):.0f} degrees there")
     return found
-
-
-def _dense(path: Sequence[Vec2]) -> list[Vec2]:
-    points = [path[0]]
-    for a, b in itertools.pairwise(path):
-        count = max(1, round(hypot(b[0] - a[0], b[1] - a[1]) / _STEP_M))
-        points += [(a[0] + (b[0] - a[0]) * k / count, a[1] + (b[1] - a[1]) * k / count) for k in range(1, count + 1)]
-    return points
 
 
 def _nearest(points: Sequence[Vec2], to: Vec2) -> int:

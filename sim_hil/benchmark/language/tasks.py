@@ -9,8 +9,8 @@ from math import atan2, cos, hypot, pi, sin
 
 import numpy as np
 
-from sim_hil.benchmark.language.openings import LINEAR, bounds_of
-from sim_hil.benchmark.language.route import RouteDescription, RouteError, tell
+from sim_hil.benchmark.language.openings import LINEAR, bounds_of, dense
+from sim_hil.benchmark.language.route import RouteDescription, RouteError, describe_route
 from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.scene.scene import Area, Scene, SceneObject, Vec2, Vec3
 
@@ -64,19 +64,16 @@ def make_task(scene: Scene, grid: NavGrid, start: Vec3, thing: SceneObject) -> T
         path = grid.path((start[0], start[1]), goal)
         if path is None:
             raise RouteError(f"there is no way to the {thing.landmark}")
-    told = tell(scene, grid, path, thing)
-    return Task(start, goal, thing.label, tuple(path), told)
+    route = describe_route(scene, grid, path, thing)
+    return Task(start, goal, thing.label, tuple(path), route)
 
 
 def _first_beside(grid: NavGrid, thing: SceneObject, path: list[Vec2]) -> Vec2 | None:
     """Return the first point of a path close to an object without a front."""
-    for a, b in itertools.pairwise(path):
-        count = max(1, round(hypot(b[0] - a[0], b[1] - a[1]) / 0.1))
-        for k in range(count + 1):
-            x, y = a[0] + (b[0] - a[0]) * k / count, a[1] + (b[1] - a[1]) * k / count
-            point = (round(x, 2), round(y, 2))
-            if outline_gap_m(thing, point) < GOAL_GAP_M and grid.is_free(*point):
-                return point
+    for x, y in dense(path):
+        point = (round(x, 2), round(y, 2))
+        if outline_gap_m(thing, point) < GOAL_GAP_M and grid.is_free(*point):
+            return point
     return None
 
 

@@ -1,35 +1,26 @@
-"""How large a thing is in the robot's picture, by rays: quick enough to check every landmark of a suite."""
+"""Size of a landmark in the robot's image, by ray casting; fast enough to check every landmark of a suite."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
 from math import cos, radians, sin, tan
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_hil.scene.scene import Scene, SceneObject, Vec2
+from sim_hil.scene.scene import Scene, SceneObject
 
 Array = NDArray[np.float64]
 
-PICTURE_PX = 128  # the policy's square picture, into which a 16:9 view is squeezed
+PICTURE_PX = 128  # side of the policy's square image, to which a 16:9 view is scaled
 HFOV_RAD = radians(100.0)
 ASPECT = 16 / 9
 EYE_M = 0.36  # height of the robot's camera
-_SAMPLES = 6  # a side of each face's grid of rays
-
-
-@dataclass(frozen=True)
-class Sight:
-    """The best view of a thing along a way: its size in the picture, px (of 128 x 128), and from how far."""
-
-    pixels: float
-    range_m: float
-    at_m: float  # how far along the way
+_SAMPLES = 6  # rays along each side of a face
 
 
 class Sightlines:
-    """Who can be seen from where in one scene."""
+    """Lines of sight in one scene."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
@@ -42,7 +33,7 @@ class Sightlines:
         self._boxes = np.array(rows, dtype=np.float64).reshape(-1, 8)
 
     def pixels(self, eye: tuple[float, float, float], heading_rad: float, thing: SceneObject, range_m: float) -> float:
-        """Area of the part of a thing's bounding box that is seen, px of a 128 x 128 picture; 0 beyond the range."""
+        """Return the visible area of a thing's bounding box, px of a 128 x 128 image; 0 beyond the range."""
         c, s = cos(heading_rad), sin(heading_rad)
         dx, dy = thing.position_m[0] - eye[0], thing.position_m[1] - eye[1]
         reach = float(np.hypot(*thing.size_m[:2])) / 2
@@ -66,23 +57,13 @@ class Sightlines:
         scale = (PICTURE_PX / 2) ** 2 / (half_x * half_y)
         return float(np.sum(scale * areas[seen] / depth[seen] ** 3))
 
-    def best(self, path: list[tuple[float, float, float]], thing: SceneObject, range_m: float) -> Sight:
-        """The best view along poses (x, y, heading)."""
-        best, walked = Sight(0.0, 0.0, 0.0), 0.0
-        last: Vec2 | None = None
-        for x, y, heading in path:
-            if last is not None:
-                walked += float(np.hypot(x - last[0], y - last[1]))
-            last = (x, y)
-            found = self.pixels((x, y, EYE_M), heading, thing, range_m)
-            if found > best.pixels:
-                gap = float(np.hypot(thing.position_m[0] - x, thing.position_m[1] - y))
-                best = Sight(found, gap, walked)
-        return best
+    def most_pixels(self, path: Iterable[tuple[float, float, float]], thing: SceneObject, range_m: float) -> float:
+        """Return the largest area of a thing in the images along poses (x m, y m, heading rad), px."""
+        return max((self.pixels((x, y, EYE_M), heading, thing, range_m) for x, y, heading in path), default=0.0)
 
 
 def _faces(thing: SceneObject, eye: tuple[float, float, float]) -> tuple[Array, Array]:
-    """Points on the faces that look at the eye, and each one's area times |n . d| (d: from the eye to the point)."""
+    """Return points on the faces towards the eye, and each one's area times |n . d| (d: from the eye to the point)."""
     depth, width, height = thing.size_m
     c, s = cos(thing.heading_rad), sin(thing.heading_rad)
     base = np.array(thing.position_m)
@@ -105,7 +86,7 @@ def _faces(thing: SceneObject, eye: tuple[float, float, float]) -> tuple[Array, 
 
 
 def _blocked(origin: Array, points: Array, boxes: Array) -> NDArray[np.bool_]:
-    """For each point whether a box lies between it and the origin (slab test in each box's frame)."""
+    """Return for each point whether a box lies between it and the origin (slab test in each box's frame)."""
     ray = points - origin  # [n, 3]
     boxes = boxes[_between(origin, ray, boxes)]
     if not len(boxes):
@@ -129,7 +110,7 @@ def _blocked(origin: Array, points: Array, boxes: Array) -> NDArray[np.bool_]:
 
 
 def _between(origin: Array, ray: Array, boxes: Array) -> NDArray[np.bool_]:
-    """Boxes that come near the bundle of rays, seen from above: the others cannot block any."""
+    """Return which boxes come near the bundle of rays in the floor plan; the others cannot block any."""
     middle = ray[:, :2].mean(axis=0)
     ahead = middle / max(float(np.hypot(*middle)), 1e-9)
     along, across = ray[:, :2] @ ahead, ray[:, 1] * ahead[0] - ray[:, 0] * ahead[1]

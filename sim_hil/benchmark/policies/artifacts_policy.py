@@ -181,7 +181,7 @@ class _Drive:
             "reason": command.reason,
             "target": None if command.target is None else list(command.target.as_tuple()),
             "speed_scale": supervision.speed_scale,
-            "says": supervision.says or self._reasoner.cycle.failure or "",
+            "says": supervision.message or self._reasoner.cycle.failure or "",
             "stopped_by": supervision.active[0] if supervision.stop and supervision.active else "",
         }
 

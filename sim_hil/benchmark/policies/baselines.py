@@ -19,37 +19,39 @@ if TYPE_CHECKING:
 
 CONTROL_S: Final = 0.1
 _TAG: Final = 31
-STILL: Final[Velocity] = (0.0, 0.0, 0.0)
 
 
-class StillPolicy:
-    """Policy that never moves; it measures the collision rate caused by the crowd alone."""
+class _Baseline:
+    """A policy without an image, notes or anything to release."""
 
-    name = "still"
     privileged = False
     needs_image = False
 
     def reset(self, episode: Episode, instruction: str, world: EpisodeWorld | None, seed: int) -> None:
         """Do nothing."""
 
-    def act(self, observation: Observation) -> Velocity:
-        """Return zero velocity."""
-        return STILL
-
     def notes(self) -> Mapping[str, object]:
-        """Nothing."""
+        """Return nothing."""
         return {}
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Release nothing."""
 
 
-class RandomPolicy:
+class StillPolicy(_Baseline):
+    """Policy that never moves; it measures the collision rate caused by the crowd alone."""
+
+    name = "still"
+
+    def act(self, observation: Observation) -> Velocity:
+        """Return zero velocity."""
+        return (0.0, 0.0, 0.0)
+
+
+class RandomPolicy(_Baseline):
     """Policy that walks randomly in velocity space (Ornstein-Uhlenbeck), never backwards, at about 0.5 m/s."""
 
     name = "random"
-    privileged = False
-    needs_image = False
 
     _FORWARD: Final = (0.5, 0.25, 4.0)  # mean m/s, standard deviation, correlation s
     _TURN: Final = (0.0, 0.5, 2.0)  # mean rad/s, standard deviation, correlation s
@@ -73,20 +75,11 @@ class RandomPolicy:
         keep = exp(-CONTROL_S / correlation_s)
         return mean + keep * (value - mean) + sigma * sqrt(1 - keep * keep) * float(self._rng.standard_normal())
 
-    def notes(self) -> Mapping[str, object]:
-        """Nothing."""
-        return {}
 
-    def close(self) -> None:
-        """Nothing to release."""
-
-
-class PointGoalPolicy:
+class PointGoalPolicy(_Baseline):
     """Policy that knows only the goal's position by odometry: it turns to it, drives straight and stops on contact."""
 
     name = "point-goal"
-    privileged = False
-    needs_image = False
 
     def __init__(self, speed_mps: float = 0.8) -> None:
         if not 0 < speed_mps <= 1.5:
@@ -113,9 +106,6 @@ class PointGoalPolicy:
     def notes(self) -> Mapping[str, object]:
         """Return `waypoints`: the goal in the base frame, m."""
         return {"waypoints": [list(self._ahead)]}
-
-    def close(self) -> None:
-        """Nothing to release."""
 
 
 def make_baseline(name: str) -> Policy:

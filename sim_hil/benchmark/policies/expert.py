@@ -54,20 +54,20 @@ class ExpertPolicy:
     needs_image = False
 
     def __init__(
-        self, *, margin_m: float = 0.0, speed_mps: float | None = None, told: Sequence[Vec2] = (),
+        self, *, margin_m: float = 0.0, speed_mps: float | None = None, prescribed: Sequence[Vec2] = (),
         patient: bool = False, rests: bool = False, wall_m: float = 0.0,
     ) -> None:  # fmt: skip
         """Create the benchmark's expert; a teacher sets further options.
 
         `margin_m`: distance kept to people in addition to the benchmark's. `speed_mps`: replaces the robot's
-        comfortable speed. `told`: the route of the student's instruction, points in m; the expert follows it even if
-        another one is shorter. `patient`: keep the distance to people even after standing for long, because it is the
-        student that stands. `rests`: stand at the route's end; in the benchmark the episode is over by then. `wall_m`:
-        width added to each side of the robot where there is room, because a student drives less exactly.
+        comfortable speed. `prescribed`: the route of the student's instruction, points in m, followed even if another
+        one is shorter. `patient`: keep the distance to people even after standing for long, because it is the student
+        that stands. `rests`: stand at the route's end; in the benchmark the episode is over by then. `wall_m`: width
+        added to each side of the robot where there is room, because a student drives less exactly.
         """
         self._rests, self._wall_m = rests, wall_m
         self._patient = patient
-        self._told = told
+        self._prescribed = prescribed
         self._margin_m = margin_m
         self._speed_mps = speed_mps
         self._world: EpisodeWorld | None = None
@@ -89,7 +89,7 @@ class ExpertPolicy:
             world.robot.radius_m,
             max_step_m(episode.robot),
             NEAR * episode.threshold_m,
-            self._told,
+            self._prescribed,
         )
         pose = world.pose()
         if not planner.reachable(pose.x_m, pose.y_m):

@@ -40,8 +40,8 @@ class RoutePlanner:
     """Planner of routes to one goal.
 
     `clearance_m`: least distance from the robot's centre to an obstacle. `near_m`: a route may end within this distance
-    of the goal if people occupy it. `told`: points (m) of a prescribed route that is preferred. Raises ValueError if
-    the scene has no free space.
+    of the goal if people occupy it. `prescribed`: points (m) of a preferred route. Raises ValueError if the scene has
+    no free space.
     """
 
     def __init__(
@@ -51,11 +51,11 @@ class RoutePlanner:
         clearance_m: float,
         max_step_m: float,
         near_m: float = 0.0,
-        told: Sequence[Vec2] = (),
+        prescribed: Sequence[Vec2] = (),
     ) -> None:
         self.grid = NavGrid(scene, clearance_m=clearance_m, max_step_m=max_step_m)
         self._goal = goal_xy
-        self._price = self._static_price(scene) * self._stray_price(told)
+        self._price = self._static_price(scene) * self._stray_price(prescribed)
         self._coarsen()
         self._ends, self._end_prices = self._ends_near(near_m)
         self._costs, self._onwards = self._search(np.zeros((0, 2)))
@@ -74,12 +74,12 @@ class RoutePlanner:
                     cv2.fillPoly(street, [np.array(cells, np.int32)], value)
         return np.asarray(np.where(street > 0, price * _STREET_PRICE, price))
 
-    def _stray_price(self, told: Sequence[Vec2]) -> Array:
+    def _stray_price(self, prescribed: Sequence[Vec2]) -> Array:
         """Return the price factor of each cell for leaving the prescribed route."""
         off = np.ones(self.grid.shape, np.uint8)
-        if not told:
+        if not prescribed:
             return off.astype(np.float64)
-        cells = [self.grid.cell(x, y)[::-1] for x, y in told]
+        cells = [self.grid.cell(x, y)[::-1] for x, y in prescribed]
         cv2.polylines(off, [np.array(cells, np.int32)], isClosed=False, color=0)
         gap_m = cv2.distanceTransform(off, cv2.DIST_L2, 5) * self.grid.resolution_m
         return np.asarray(1.0 + _STRAY_PRICE * np.clip(gap_m / _WAY_M - 1.0, 0.0, 1.0), np.float64)

@@ -15,13 +15,7 @@ _Z2 = 1.959964**2  # 97.5 % point of the normal distribution, squared
 Range = tuple[float, float]
 
 
-def mean_ci95(
-    values: Sequence[float],
-    tasks: Sequence[str],
-    bounds: Range | None = None,
-    seed: int = SEED,
-    resamples: int = RESAMPLES,
-) -> Range | None:
+def mean_ci95(values: Sequence[float], tasks: Sequence[str], bounds: Range | None = None) -> Range | None:
     """Return the 95 % interval of the mean of per-episode values; None for fewer than two values.
 
     Two-stage percentile bootstrap, because episodes of one task are correlated: draw tasks with replacement, then as
@@ -37,7 +31,7 @@ def mean_ci95(
     if bounds is not None and np.ptp(array) == 0:
         value, share = float(array[0]), _Z2 / (len(array) + _Z2)
         return value - share * (value - bounds[0]), value + share * (bounds[1] - value)
-    low, high = np.percentile(_resampled_means(array, tasks, seed, resamples), (2.5, 97.5))
+    low, high = np.percentile(_resampled_means(array, tasks), (2.5, 97.5))
     return float(low), float(high)
 
 
@@ -46,26 +40,22 @@ def paired_ci95(
     after: Sequence[float],
     tasks: Sequence[str],
     bounds: Range | None = None,
-    seed: int = SEED,
-    resamples: int = RESAMPLES,
 ) -> Range | None:
     """Return the 95 % interval of the mean of `after - before` per episode; `bounds` are those of one value."""
     if len(before) != len(after):
         raise ValueError(f"paired bootstrap: expected as many values on both sides, found {len(before)}, {len(after)}")
     most = None if bounds is None else bounds[1] - bounds[0]
     differences = [b - a for a, b in zip(before, after, strict=True)]
-    return mean_ci95(differences, tasks, None if most is None else (-most, most), seed, resamples)
+    return mean_ci95(differences, tasks, None if most is None else (-most, most))
 
 
-def _resampled_means(
-    values: NDArray[np.float64], tasks: Sequence[str], seed: int, resamples: int
-) -> NDArray[np.float64]:  # fmt: skip
+def _resampled_means(values: NDArray[np.float64], tasks: Sequence[str]) -> NDArray[np.float64]:
     _, task_of, sizes = np.unique(np.asarray(tasks), return_inverse=True, return_counts=True)
     by_task = np.zeros((len(sizes), int(sizes.max())))  # [task, episode], padded with zeros
     for task in range(len(sizes)):
         by_task[task, : sizes[task]] = values[task_of == task]
-    rng = np.random.default_rng((seed, _TAG))
-    picked = rng.integers(0, len(sizes), size=(resamples, len(sizes)))
+    rng = np.random.default_rng((SEED, _TAG))
+    picked = rng.integers(0, len(sizes), size=(RESAMPLES, len(sizes)))
     sums = np.zeros(picked.shape)
     for turn in range(by_task.shape[1]):  # one episode of every drawn task at a time, to limit memory
         which = rng.integers(0, sizes[picked])

@@ -6,20 +6,20 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from edge.core.cli import write_whole
-from reporting import page
-from reporting.plot_style import delay_histogram
+from reporting.page import Cell, Figure, Table, mark, render
+from reporting.plot_style import BAD, GOOD, INK, MUTED, TRUTH, delay_histogram, legend_above, new_figure, png, tidy
 from sim_hil.benchmark.conditions.conditions import Conditions
-from sim_hil.benchmark.results import report_figures
-from sim_hil.benchmark.results.episode_log import read_log
-from sim_hil.benchmark.results.record import EpisodeResult
+from sim_hil.benchmark.results.record import EpisodeResult, read_log
 from sim_hil.benchmark.results.store import EPISODES, VIDEOS, ResultStore
-from sim_hil.benchmark.results.summary import METRICS, grouped_by
+from sim_hil.benchmark.results.summary import GROUPS, METRICS, grouped_by, interval_of
 from sim_hil.benchmark.results.video import last_picture
-from sim_hil.scene.scene import SceneError, load_scene
+from sim_hil.scene.map import draw_map, draw_mark, draw_path, map_view
+from sim_hil.scene.scene import Scene, SceneError, load_scene
 
 REPORT = "report.html"
 SHOWN_TEXTS = 12
@@ -33,74 +33,66 @@ _HEADLINE = {
     "cr": ("collisions", "%"),
 }
 
+Path2 = NDArray[np.float64]
+
+_TITLES = {"scene": "scene", "crowd": "people in the scene", "robot": "robot"}
+_MAP_PX = 1400
+_SUCCESS, _COLLIDED, _FAILED = (44, 140, 74), (230, 140, 20), (179, 38, 30)
+_START, _GOAL = (31, 111, 139), (44, 140, 74)
+
 
 def write_report(store: ResultStore, summary: Mapping[str, object], title: str) -> Path:
     """Write the page into the run's directory and return its path. Raises OSError."""
     path = store.directory / REPORT
     results = sorted(store.results, key=lambda result: result.id)
-    write_whole(path, page.document(title, "\n".join(part for part in _parts(store, results, summary, title) if part)))
+    conditions = Conditions.of_json(store.config["conditions"])
+    failed = [(run.id, str(run.attempts), run.why) for run in store.failed]
+    page = render(
+        "benchmark",
+        title=title,
+        conditions=conditions.describe(),
+        suite=store.config["suite"],
+        finished=len(results),
+        requested=len(store.config["episodes"]),
+        untrained=not store.config.get("trained", True),
+        tiles=_headline(summary),
+        failed=Table(("episode", "attempts", "why"), failed, numeric=frozenset({1})),
+        **(_results(store, results, summary, conditions) if results else {}),
+    )
+    write_whole(path, page)
     return path
 
 
-def _parts(
-    store: ResultStore, results: Sequence[EpisodeResult], summary: Mapping[str, Any], title: str
-) -> list[str]:  # fmt: skip
-    conditions = Conditions.of_json(store.config["conditions"])
+def _results(
+    store: ResultStore, results: Sequence[EpisodeResult], summary: Mapping[str, Any], conditions: Conditions
+) -> dict[str, object]:
+    """Return the values of the part of the page about finished episodes."""
     logs = {result.id: _log(store.directory, result.id) for result in results}
-    requested = len(store.config["episodes"])
-    parts = [
-        f"<h1>{page.text_html(title)}</h1>",
-        f'<p class="quiet">{page.text_html(conditions.describe())}; suite “{page.text_html(store.config["suite"])}”, '
-        f"{len(results)} of {requested} episodes finished. Rates are percent of episodes, intervals are 95 % bootstrap "
-        "over tasks and their episodes. Paths and collisions are ground truth, not the robot's odometry.</p>",
-        _untrained(store.config),
-        page.tiles(_headline(summary)),
-        _failed(store),
-    ]
-    if not results:
-        return parts
     delays = np.array([d for log in logs.values() if log for d in log["columns"]["delay_s"] if d is not None], float)
-    return [
-        *parts,
-        "<h2>Success and collisions</h2>",
-        page.figure(
-            report_figures.rates(results), "Bars of success and collision rate",
+    caption = "Age of the semantic state in every control period that had one."
+    return {
+        "rates": Figure(
+            rates(results), "Bars of success and collision rate",
             "The number of episodes is below each name.", wide=True,
         ),
-        _group_tables(summary),
-        *_distributions(results, delays),
-        "<h2>Where the robot went</h2>",
-        *_maps(results, logs),
-        _endings(store.directory, results),
-        _texts(results, logs),
-        "<h2>Episodes</h2>",
-        _episode_table(store.directory, results),
-        "<h2>Conditions and versions</h2>",
-        page.table(
-            ("what", "value"),
-            [(page.text_html(key), page.text_html(str(value))) for key, value in _facts(store.config, conditions)],
+        "groups": _group_table(summary),
+        "error_and_time": Figure(
+            error_and_time(results, width_in=5.4 if len(delays) else 11.0),
+            "Distance to the goal against time used", "One point per episode.", wide=not len(delays),
         ),
-    ]  # fmt: skip
-
-
-def _distributions(results: Sequence[EpisodeResult], delays: NDArray[np.float64]) -> list[str]:
-    labels = ("Distance to the goal against time used", "One point per episode.")
-    if not len(delays):
-        return [page.figure(report_figures.error_and_time(results, width_in=11.0), *labels, wide=True)]
-    caption = "Age of the semantic state in every control period that had one."
-    return [
-        '<div class="pair">',
-        page.figure(report_figures.error_and_time(results, width_in=5.4), *labels),
-        page.figure(delay_histogram(delays), "Histogram of the delay", caption),
-        "</div>",
-    ]
+        "delays": Figure(delay_histogram(delays), "Histogram of the delay", caption) if len(delays) else None,
+        "maps": _maps(results, logs),
+        "endings": _endings(store.directory, results),
+        "texts": _texts(results, logs),
+        "episodes": _episode_table(store.directory, results),
+        "facts": Table(("what", "value"), [(key, str(value)) for key, value in _facts(store.config, conditions)]),
+    }  # fmt: skip
 
 
 def _hits(result: EpisodeResult) -> str:
     """Return the first few labels of what the robot hit."""
     more = len(result.collisions) - SHOWN_HITS
-    shown = [*result.collisions[:SHOWN_HITS], *([f"{more} more"] if more > 0 else [])]
-    return page.text_html(", ".join(shown))
+    return ", ".join([*result.collisions[:SHOWN_HITS], *([f"{more} more"] if more > 0 else [])])
 
 
 def _log(directory: Path, episode_id: str) -> dict[str, Any] | None:
@@ -108,15 +100,6 @@ def _log(directory: Path, episode_id: str) -> dict[str, Any] | None:
         return read_log(directory / EPISODES / f"{episode_id}.json")
     except (OSError, ValueError):
         return None  # results do not depend on it; the map's caption gives the number of paths
-
-
-def _untrained(config: Mapping[str, object]) -> str:
-    if config.get("trained", True):
-        return ""
-    return (
-        '<p class="notice"><b>The weights are untrained</b> (initialised from a seed): the robot moves at random. '
-        "This run shows that the benchmark works, not how good a policy is.</p>"
-    )
 
 
 def _headline(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -129,25 +112,18 @@ def _headline(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [*tiles, (str(summary["episodes"]), "episodes")]
 
 
-def _failed(store: ResultStore) -> str:
-    if not store.failed:
-        return ""
-    rows = [(page.text_html(run.id), str(run.attempts), page.text_html(run.why)) for run in store.failed]
-    return (
-        '<p class="notice"><b>Some episodes have no result</b>: their process died in every attempt. '
-        "No rate above includes them; <code>--resume</code> tries them again.</p>"
-        + page.table(("episode", "attempts", "why"), rows, numeric=frozenset({1}))
-    )
-
-
-def _group_tables(summary: Mapping[str, Any]) -> str:
-    rows = []
-    for group in ("by_scene", "by_crowd", "by_robot"):
-        for key, means in summary[group].items():
-            cells = [_with_interval(means, name) for name in METRICS]
-            rows.append((f"{group.removeprefix('by_')}: {page.text_html(key)}", str(means["episodes"]), *cells))
+def _group_table(summary: Mapping[str, Any]) -> Table:
+    rows = [
+        (
+            f"{group.removeprefix('by_')}: {key}",
+            str(means["episodes"]),
+            *(_with_interval(means, name) for name in METRICS),
+        )
+        for group in ("by_scene", "by_crowd", "by_robot")
+        for key, means in summary[group].items()
+    ]
     head = ("group", "episodes", "SR %", "SPL %", "NE m", "CR %")
-    return page.table(head, rows, numeric=frozenset({1, 2, 3, 4, 5}))
+    return Table(head, rows, numeric=frozenset({1, 2, 3, 4, 5}))
 
 
 def _with_interval(means: Mapping[str, Any], name: str) -> str:
@@ -156,23 +132,24 @@ def _with_interval(means: Mapping[str, Any], name: str) -> str:
     return f"{means[name]:.1f}{span}"
 
 
-def _maps(results: Sequence[EpisodeResult], logs: Mapping[str, dict[str, Any] | None]) -> list[str]:
-    parts = []
+def _maps(results: Sequence[EpisodeResult], logs: Mapping[str, dict[str, Any] | None]) -> list[Figure | str]:
+    """Return the map of each scene, or the name of a scene that is not on this machine."""
+    parts: list[Figure | str] = []
     for name, members in grouped_by(results, "scene"):
         shown = [(result, log) for result in members if (log := logs[result.id]) is not None]
         try:
             scene = load_scene(name)
         except SceneError:
-            parts.append(f"<p>Scene {page.text_html(name)} is not on this machine: no map.</p>")
+            parts.append(name)
             continue
         ended, logged = [result for result, _ in shown], [log for _, log in shown]
         goals = [log["goal_xy"] for log in logged]
-        picture = report_figures.scene_map(scene, ended, [_path(log) for log in logged], goals)
+        picture = scene_map(scene, ended, [_path(log) for log in logged], goals)
         caption = (
             f"{name}: {len(shown)} of {len(members)} episodes. Blue: start; green ring: goal. Paths: green reached "
             "without a collision, orange reached with one, red not reached."
         )
-        parts.append(page.figure(picture, f"Map of {name} with the paths", caption, wide=True))
+        parts.append(Figure(picture, f"Map of {name} with the paths", caption, wide=True))
     return parts
 
 
@@ -181,62 +158,50 @@ def _path(log: Mapping[str, Any]) -> NDArray[np.float64]:
     return np.column_stack([np.array(columns["x_m"], float), np.array(columns["y_m"], float)])
 
 
-def _endings(directory: Path, results: Sequence[EpisodeResult]) -> str:
+def _endings(directory: Path, results: Sequence[EpisodeResult]) -> list[dict[str, object]]:
     """Return the last frames of some videos; failed episodes come first, then those with collisions."""
-    cards: list[str] = []
+    endings: list[dict[str, object]] = []
     for result in sorted(results, key=lambda result: (result.success, not result.collided)):
         path = directory / VIDEOS / f"{result.id}.mp4"
-        picture = last_picture(path, _CARD_PX) if len(cards) < SHOWN_ENDINGS and path.is_file() else None
+        picture = last_picture(path, _CARD_PX) if len(endings) < SHOWN_ENDINGS and path.is_file() else None
         if picture is None:
             continue
-        name = page.text_html(result.id)
         hit = f", collided with {_hits(result)}" if result.collided else ""
-        cards.append(
-            f'<figure><img src="{page.image_uri(picture, "jpeg")}" alt="Last frame of {name}">'
-            f'<div class="meta"><a href="{VIDEOS}/{name}.mp4">{name}</a>: {page.text_html(result.end)} after '
-            f"{result.time_s:.0f} s, {result.ne_m:.1f} m from the goal{hit}</div></figure>"
-        )
-    return f'<h2>How episodes ended</h2><div class="sheet">{"".join(cards)}</div>' if cards else ""
+        text = f"{result.end} after {result.time_s:.0f} s, {result.ne_m:.1f} m from the goal{hit}"
+        endings.append({"id": result.id, "jpeg": picture, "video": f"{VIDEOS}/{path.name}", "text": text})
+    return endings
 
 
-def _texts(results: Sequence[EpisodeResult], logs: Mapping[str, dict[str, Any] | None]) -> str:
-    cards = []
+def _texts(results: Sequence[EpisodeResult], logs: Mapping[str, dict[str, Any] | None]) -> list[tuple[str, str]]:
+    """Return facts and text of the middle generation of some episodes."""
+    texts = []
     for result in results:
         log = logs[result.id]
         if log is None or not log["generations"]:
             continue
         generation = log["generations"][len(log["generations"]) // 2]
-        text = page.text_html(str(generation.get("text", ""))) or "(empty)"
-        released_s = generation["released_s"] - generation["anchor_s"]
-        cards.append(
-            f'<figure><div class="meta">{page.text_html(result.id)} · generation {generation["generation"]} · anchor '
-            f"{generation['anchor_s']:.1f} s · Δt {released_s:.1f} s at release</div>"
-            f'<pre class="vlm">{text}</pre></figure>'
+        meta = (
+            f"{result.id} · generation {generation['generation']} · anchor {generation['anchor_s']:.1f} s · "
+            f"Δt {generation['released_s'] - generation['anchor_s']:.1f} s at release"
         )
-    if not cards:
-        return ""
-    step = max(1, len(cards) // SHOWN_TEXTS)
-    shown = "".join(cards[::step][:SHOWN_TEXTS])
-    return f'<h2>Reasoning text of the VLM</h2><div class="sheet">{shown}</div>'
+        texts.append((meta, str(generation.get("text", ""))))
+    return texts[:: max(1, len(texts) // SHOWN_TEXTS)][:SHOWN_TEXTS]
 
 
-def _episode_table(directory: Path, results: Sequence[EpisodeResult]) -> str:
+def _episode_table(directory: Path, results: Sequence[EpisodeResult]) -> Table:
     rows = []
     for r in results:
-        mark = (
-            '<span class="pass">reached</span>' if r.success else f'<span class="fail">{page.text_html(r.end)}</span>'
-        )
-        video = directory / VIDEOS / f"{r.id}.mp4"
-        name = page.text_html(r.id)
-        link = f'<a href="{VIDEOS}/{name}.mp4">{name}</a>' if video.is_file() else name
+        video = f"{VIDEOS}/{r.id}.mp4"
+        name = Cell(r.id, link=video) if (directory / video).is_file() else r.id
         delay = "" if r.delay_s is None else f"{r.delay_s['mean']:.1f}"
         numbers = (f"{r.ne_m:.1f}", f"{r.spl:.0f}", f"{r.path_m:.1f}", f"{r.shortest_m:.1f}", f"{r.time_s:.0f}", delay)
-        rows.append((link, r.scene, r.robot, str(r.people), mark, _hits(r), *numbers))
+        end = mark(r.success, "reached" if r.success else r.end)
+        rows.append((name, r.scene, r.robot, str(r.people), end, _hits(r), *numbers))
     head = (
         "episode", "scene", "robot", "people", "end", "collided with", "NE m", "SPL %", "path m", "shortest m",
         "time s", "mean Δt s",
     )  # fmt: skip
-    return page.table(head, rows, numeric=frozenset({3, *range(6, 12)}))
+    return Table(head, rows, numeric=frozenset({3, *range(6, 12)}))
 
 
 def _facts(config: Mapping[str, Any], conditions: Conditions) -> list[tuple[str, object]]:
@@ -247,3 +212,68 @@ def _facts(config: Mapping[str, Any], conditions: Conditions) -> list[tuple[str,
         facts.append(("latency", f"{latency.name}, mean {latency.mean_s:.2f} s of {count} ({latency.source})"))
     facts += [(f"version of {name}", value) for name, value in config["versions"].items()]
     return [*facts, ("suite, SHA-256 of its episodes", config["suite_sha256"])]
+
+
+def rates(results: Sequence[EpisodeResult]) -> bytes:
+    """Plot success and collision rate with 95 % bootstrap intervals, by scene, crowd and robot."""
+    groups = [(name, grouped_by(results, name)) for name in GROUPS]
+    widths = [max(1, len(members)) + 0.6 for _, members in groups]
+    figure = new_figure(11.0, 3.6)
+    all_axes = figure.subplots(1, len(groups), sharey=True, width_ratios=widths)
+    for axes, (name, members) in zip(all_axes, groups, strict=True):
+        at = np.arange(len(members), dtype=float)
+        for offset, metric, colour, label in ((-0.2, "sr", TRUTH, "success"), (0.2, "cr", BAD, "collision")):
+            means = np.array([float(np.mean([METRICS[metric](result) for result in each])) for _, each in members])
+            spans = [interval_of(each, metric) or (mean, mean) for (_, each), mean in zip(members, means, strict=True)]
+            errors = np.array([[m - low, high - m] for m, (low, high) in zip(means, spans, strict=True)]).T
+            axes.bar(at + offset, means, 0.36, color=colour, alpha=0.9, label=f"{label} rate")
+            axes.errorbar(at + offset, means, np.maximum(errors, 0), fmt="none", ecolor=INK, elinewidth=1, capsize=2.5)
+            for x, mean in zip(at + offset, means, strict=True):
+                axes.annotate(f"{mean:.0f}", (x, 3), ha="center", fontsize=7, color="white" if mean > 8 else INK)
+        axes.set_xticks(at, [f"{key}\n({len(each)})" for key, each in members])
+        axes.set_xlabel(_TITLES[name], fontsize=9)
+        axes.set_ylim(0, 105)
+        tidy(axes)
+    all_axes[0].set_ylabel("% of episodes", fontsize=9)
+    legend_above(all_axes[-1])
+    return png(figure)
+
+
+def scene_map(
+    scene: Scene, results: Sequence[EpisodeResult], paths: Sequence[Path2], goals: Sequence[Sequence[float]]
+) -> bytes:
+    """Draw a scene from above with each episode's goal (x m, y m) and true path [n, 2] m, coloured by its end."""
+    span_m = max(scene.floor_max_m[0] - scene.floor_min_m[0], 1.0)
+    px_per_m = min(40.0, _MAP_PX / (span_m + 1))
+    image, view = draw_map(scene, px_per_m, names=True), map_view(scene, px_per_m)
+    for goal in goals:
+        draw_mark(image, view, (goal[0], goal[1]), _GOAL, 0.5, filled=False)
+    for result, path in sorted(zip(results, paths, strict=True), key=lambda pair: pair[0].success):
+        colour = _FAILED if not result.success else _COLLIDED if result.collided else _SUCCESS
+        draw_path(image, view, [(float(x), float(y)) for x, y in path], colour, 2)
+        draw_mark(image, view, (float(path[0, 0]), float(path[0, 1])), _START, 0.2)
+        draw_mark(image, view, (float(path[-1, 0]), float(path[-1, 1])), colour, 0.15)
+    done, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    if not done:
+        raise ValueError(f"map of {scene.name}: cannot be written as PNG")
+    return bytes(data.tobytes())
+
+
+def error_and_time(results: Sequence[EpisodeResult], width_in: float) -> bytes:
+    """Plot each episode's final distance to the goal over the share of its time limit used."""
+    figure = new_figure(width_in, 3.1)
+    axes = figure.add_subplot()
+    for label, colour, chosen in (
+        ("reached", GOOD, [r for r in results if r.success]),
+        ("not reached", BAD, [r for r in results if not r.success]),
+    ):
+        share = [100 * r.time_s / r.timeout_s for r in chosen]
+        axes.scatter(share, [r.ne_m for r in chosen], s=14, color=colour, label=label, alpha=0.8, linewidths=0)
+    axes.set_xlabel("% of the episode's time limit used", fontsize=9)
+    axes.set_ylabel("distance to the goal at the end, m", fontsize=9)
+    axes.set_xlim(0, 103)
+    axes.set_ylim(bottom=0)
+    axes.axvline(100, color=MUTED, linewidth=1)
+    legend_above(axes)
+    tidy(axes)
+    return png(figure)

@@ -5,6 +5,7 @@ Every second control period becomes a frame at 10 frames a second: twice real ti
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterable, Mapping
 from functools import cache
 from math import cos, hypot, sin
@@ -128,7 +129,7 @@ class EpisodeVideo:
         notes: Mapping[str, object],
     ) -> None:
         left, top, episode = 16, EYE_H + 12, self._episode
-        lines = _wrapped(f"“{self._instruction}”", 74)[:2]
+        lines = textwrap.wrap(f"“{self._instruction}”", 74)[:2]
         for line in lines:
             draw.text((left, top), line, _INK, _font("DejaVuSans-Bold.ttf", 17))
             top += 23
@@ -152,7 +153,7 @@ class EpisodeVideo:
             draw.text((left, top), says, _BAD if notes.get("says") else _MUTED, _font("DejaVuSans.ttf", 14))
             top += 22
         text = _printable(str(notes.get("text", "") or ""))[:MAX_TEXT_CHARS]
-        for line in _wrapped(text, 92)[: (HEIGHT - top - 6) // 18]:
+        for line in textwrap.wrap(text, 92)[: (HEIGHT - top - 6) // 18]:
             draw.text((left, top), line, _INK, _font("DejaVuSansMono.ttf", 13))
             top += 18
 
@@ -237,20 +238,6 @@ def _state_line(notes: Mapping[str, object]) -> str:
 def _printable(text: str) -> str:
     """Replace characters of an untrusted text that would break a line or change the writing direction."""
     return "".join(c if c.isprintable() else " " for c in text)
-
-
-def _wrapped(text: str, columns: int) -> list[str]:
-    lines, line = [], ""
-    for word in text.split():
-        while len(word) > columns:
-            lines.append(word[:columns])
-            word = word[columns:]
-        if len(line) + len(word) + 1 > columns:
-            lines.append(line)
-            line = word
-        else:
-            line = f"{line} {word}".strip()
-    return [*lines, line] if line else lines
 
 
 @cache

@@ -11,6 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import degrees, hypot, isfinite, radians
 from pathlib import Path
+from typing import Any
+
+import tomli_w
 
 from sim_hil.scene.table import Table
 
@@ -24,6 +27,9 @@ ROBOTS = ("go2", "carter")
 FORMAT = 1  # of the file; `version` in the file identifies the suite's data
 MIN_WORDINGS = 4
 MAX_PEOPLE = 200
+
+_TASK_KEYS = ("task", "scene", "goal_xy", "threshold_m", "goal_landmark", "landmarks", "instructions")
+_EPISODE_KEYS = ("id", "robot", "people", "seed", "timeout_s", "shortest_m")
 
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
@@ -83,33 +89,28 @@ class Episode:
 
 
 def _task(table: Table) -> list[Episode]:
-    task, scene = table.text("task"), table.text("scene")
-    x, y, heading_deg = table.vector("start_deg", 3)
-    goal_x, goal_y = table.vector("goal_xy", 2)
-    threshold_m = table.number("threshold_m")
-    landmarks, goal_landmark = table.texts("landmarks"), table.text("goal_landmark")
+    task, (x, y, heading_deg) = table.text("task"), table.vector("start_deg", 3)
     instructions = table.texts("instructions")
     if len(instructions) < MIN_WORDINGS:
         raise SuiteError(f"task {task!r}: expected {MIN_WORDINGS} wordings or more, found {len(instructions)}")
+    shared: dict[str, Any] = {
+        "task": task,
+        "scene": table.text("scene"),
+        "start": (x, y, radians(heading_deg)),
+        "goal_xy": table.vector("goal_xy", 2),
+        "instructions": instructions,
+        "threshold_m": table.number("threshold_m"),
+        "landmarks": table.texts("landmarks"),
+        "goal_landmark": table.text("goal_landmark"),
+    }
     episodes = []
     for row in table.tables("episodes"):
         row.what = f"task {task!r}, {row.what}"
+        name, robot, people, seed = row.text("id"), row.text("robot"), row.whole("people"), row.whole("seed")
+        timeout_s, shortest_m = row.number("timeout_s"), row.number("shortest_m")
         episodes.append(
             Episode(
-                id=row.text("id"),
-                task=task,
-                scene=scene,
-                robot=row.text("robot"),
-                people=row.whole("people"),
-                seed=row.whole("seed"),
-                start=(x, y, radians(heading_deg)),
-                goal_xy=(goal_x, goal_y),
-                instructions=instructions,
-                timeout_s=row.number("timeout_s"),
-                threshold_m=threshold_m,
-                shortest_m=row.number("shortest_m"),
-                landmarks=landmarks,
-                goal_landmark=goal_landmark,
+                id=name, robot=robot, people=people, seed=seed, timeout_s=timeout_s, shortest_m=shortest_m, **shared
             )
         )
         row.done()
@@ -160,50 +161,14 @@ def load_suite(name_or_path: str | Path) -> tuple[Episode, ...]:
     return episodes
 
 
-def _text(value: str) -> str:
-    escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{escaped}"'
-
-
-def _array(values: Sequence[str]) -> str:
-    return "[" + ", ".join(values) + "]"
-
-
 def suite_to_toml(name: str, version: int, episodes: Sequence[Episode]) -> str:
     """Format a suite as TOML for `parse_suite`; the episodes of one task must be adjacent."""
-    lines = [
-        "# Written by `python -m sim_hil.benchmark.suite.build`; a test holds the two equal.",
-        f"format = {FORMAT}",
-        f"name = {_text(name)}",
-        f"version = {version}",
-    ]
-    last = ""
+    tasks: list[dict[str, Any]] = []
     for episode in episodes:
-        if episode.task != last:
-            last = episode.task
+        if not tasks or tasks[-1]["task"] != episode.task:
             x, y, theta = episode.start
-            heading_deg = round(degrees(theta), 6)
-            lines += [
-                "",
-                "[[tasks]]",
-                f"task = {_text(episode.task)}",
-                f"scene = {_text(episode.scene)}",
-                f"start_deg = [{x!r}, {y!r}, {heading_deg!r}]",
-                f"goal_xy = [{episode.goal_xy[0]!r}, {episode.goal_xy[1]!r}]",
-                f"threshold_m = {episode.threshold_m!r}",
-                f"goal_landmark = {_text(episode.goal_landmark)}",
-                f"landmarks = {_array([_text(label) for label in episode.landmarks])}",
-                "instructions = [",
-                *(f"  {_text(text)}," for text in episode.instructions),
-                "]",
-            ]
-        lines += [
-            "[[tasks.episodes]]",
-            f"id = {_text(episode.id)}",
-            f"robot = {_text(episode.robot)}",
-            f"people = {episode.people}",
-            f"seed = {episode.seed}",
-            f"timeout_s = {episode.timeout_s!r}",
-            f"shortest_m = {episode.shortest_m!r}",
-        ]
-    return "\n".join(lines) + "\n"
+            task = {key: getattr(episode, key) for key in _TASK_KEYS}
+            tasks.append({**task, "start_deg": (x, y, round(degrees(theta), 6)), "episodes": []})
+        tasks[-1]["episodes"].append({key: getattr(episode, key) for key in _EPISODE_KEYS})
+    head = "# Written by `python -m sim_hil.benchmark.suite.build`; a test holds the two equal.\n"
+    return head + tomli_w.dumps({"format": FORMAT, "name": name, "version": version, "tasks": tasks})

@@ -1,7 +1,7 @@
 """`python -m sim_hil.benchmark.suite.validate`: check that episodes are feasible and their instructions are true.
 
 Everything is recomputed from scene, start and goal and compared with the suite's file. The rules that describe a route
-(route.tell) are shared with the builder, so the validator cannot find mistakes in them.
+(route.describe_route) are shared with the builder, so the validator cannot find mistakes in them.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from functools import cached_property
 from edge.core.cli import check_result_target, command_line, write_result
 from sim_hil.benchmark.language.instruction_reading import untrue
 from sim_hil.benchmark.language.instructions import is_held_out
-from sim_hil.benchmark.language.route import RouteError, tell
+from sim_hil.benchmark.language.route import RouteError, describe_route
 from sim_hil.benchmark.language.task_checks import named_landmarks, named_too_small, worst_leak, wrong_bends
 from sim_hil.benchmark.language.tasks import outline_gap_m
 from sim_hil.benchmark.language.visibility import Sightlines
@@ -122,7 +122,7 @@ def _truthful(episode: Episode, place: _Place) -> list[str]:
     if path is None:
         return [*found, f"no path for a robot of radius {ROUTE_CLEARANCE_M} m"]
     try:
-        route = tell(scene, grid, path, goal)
+        route = describe_route(scene, grid, path, goal)
     except RouteError as error:
         return [*found, f"the route cannot be described: {error}"]
     found += wrong_bends(route, path)

@@ -21,8 +21,7 @@ from edge.core.cli import EXIT_BAD_INPUT
 from sim_hil.benchmark.results.record import EpisodeResult
 from sim_hil.benchmark.results.store import EPISODES, VIDEOS
 from sim_hil.benchmark.workers.code_version import code_sha256
-from sim_hil.benchmark.workers.jobs import Ended
-from sim_hil.benchmark.workers.local_jobs import WORKER, LocalJobs
+from sim_hil.benchmark.workers.jobs import WORKER, Ended, LocalJobs
 from sim_hil.benchmark.workers.task import EpisodeTask
 
 ATTEMPTS = 4
@@ -111,10 +110,10 @@ class ClusterJobs:
     def _ended(self, reference: object) -> Ended:
         name = self._running.pop(reference)
         try:
-            told, files = self._ray.get(reference)
+            outcome, files = self._ray.get(reference)
         except self._ray.exceptions.RayError as error:
             return Ended(name, why=f"its cluster worker ended: {type(error).__name__}")
-        content = json.loads(told)
+        content = json.loads(outcome)
         if content["result"] is None:
             return Ended(name, why=content["why"], refused_code=content["refused_code"])
         result = replace(EpisodeResult.of_json(content["result"]), host=content["host"])
@@ -152,13 +151,13 @@ def run_on_node(task_json: str, code: str, worker: Sequence[str] | None) -> tupl
         ended = _one(task, worker)
         found = [path for path in sorted(Path(folder).rglob("*")) if path.suffix in (".json", ".mp4")]
         files = [(path.relative_to(folder).as_posix(), path.read_bytes()) for path in found]
-    told = {
+    outcome = {
         "result": None if ended.result is None else ended.result.as_json(),
         "why": ended.why,
         "refused_code": ended.refused_code,
         "host": host,
     }
-    return json.dumps(told), files
+    return json.dumps(outcome), files
 
 
 def _one(task: EpisodeTask, worker: Sequence[str] | None) -> Ended:

@@ -7,7 +7,6 @@ reproducible.
 from __future__ import annotations
 
 import json
-import platform
 import shutil
 import signal
 import threading
@@ -26,12 +25,10 @@ from edge.core.geometry import SE2
 from edge.flightlog.reader import RecordingError, read_messages
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.conditions.variants import artifact_directory
-from sim_hil.benchmark.env.metrics import FRAME_HZ, is_success
-from sim_hil.benchmark.env.outcome import measure
-from sim_hil.benchmark.results.episode_log import EpisodeLog
-from sim_hil.benchmark.results.record import EpisodeResult
+from sim_hil.benchmark.env.metrics import FRAME_HZ, is_success, measure
+from sim_hil.benchmark.results.record import EpisodeLog, EpisodeResult
 from sim_hil.benchmark.suite.episode import Episode
-from sim_hil.benchmark.workers.task import EpisodeTask
+from sim_hil.benchmark.workers.task import EpisodeTask, episode_result
 from sim_hil.realtime.stack import Stack, StackOptions, free_domain
 from sim_hil.realtime.truth import TruePose, TruthTail, read_lines
 
@@ -41,7 +38,7 @@ ARM_TIMEOUT_S: Final = 90.0
 POLL_S: Final = 0.05
 FOLDER: Final = "realtime"
 
-Tell = Callable[[float], None]
+OnTime = Callable[[float], None]
 
 
 def check_realtime(conditions: Conditions, *, jobs: int, cluster: bool, video: str) -> None:
@@ -77,7 +74,7 @@ class RealtimeDrive:
     time_s: float = 0.0
 
 
-def run_realtime(task: EpisodeTask, tell: Tell) -> EpisodeResult:
+def run_realtime(task: EpisodeTask, on_time: OnTime) -> EpisodeResult:
     """Run one episode. Raises StepError when a process of the stack fails, ConditionsError for another robot."""
     started_ns = time.monotonic_ns()
     episode, conditions = task.episode, task.conditions
@@ -100,10 +97,10 @@ def run_realtime(task: EpisodeTask, tell: Tell) -> EpisodeResult:
         pose_hz=FRAME_HZ,
     )
     with _asked_to_end(), Stack(options) as stack:
-        drive = _run(stack, task, tell)
-        stack.end_runner()
-        stack.end_bridge()
-        stack.end_robot()
+        drive = _run(stack, task, on_time)
+        stack.end("runner")
+        stack.end("bridge")
+        stack.end("robot")
     fell = bool(_json(stack.result("edge-hil")).get("fell", False))
     if fell and drive.end != "reached":
         drive.end = "fell"
@@ -119,35 +116,8 @@ def run_realtime(task: EpisodeTask, tell: Tell) -> EpisodeResult:
     log, generations = _log(stack, drive.poses)
     log.write(task.log_path, generations, _last_people(stack.trace), episode.goal_xy)
     stopped_by = next(iter(_json(stack.result("edge-run-1")).get("faults", [])), "") if drive.end == "stopped" else ""
-    return EpisodeResult(
-        id=episode.id,
-        task=episode.task,
-        scene=episode.scene,
-        people=episode.people,
-        robot=episode.robot,
-        seed=episode.seed,
-        wording=conditions.wording,
-        instruction=task.instruction,
-        success=outcome.success,
-        ne_m=outcome.ne_m,
-        spl=100 * outcome.spl,
-        collided=outcome.collided,
-        collisions=outcome.collisions,
-        first_collision_s=outcome.first_collision_s,
-        fell=outcome.fell,
-        end=outcome.end,
-        path_m=outcome.path_m,
-        shortest_m=outcome.shortest_m,
-        time_s=outcome.time_s,
-        timeout_s=episode.timeout_s,
-        trajectory_sha256=outcome.trajectory_sha256,
-        delay_s=log.delay_summary(),
-        generations=len(generations),
-        stopped_by=str(stopped_by),
-        clock=conditions.clock,
-        wall_s=round((time.monotonic_ns() - started_ns) / 1e9, 3),
-        attempts=task.attempt,
-        host=platform.node(),
+    return episode_result(
+        task, outcome, log, generations=len(generations), stopped_by=str(stopped_by), started_ns=started_ns
     )
 
 
@@ -168,7 +138,7 @@ def _asked_to_end() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def _run(stack: Stack, task: EpisodeTask, tell: Tell) -> RealtimeDrive:
+def _run(stack: Stack, task: EpisodeTask, on_time: OnTime) -> RealtimeDrive:
     """Start the stack and record the robot until the episode is over; its time starts when the robot is armed."""
     stack.start_robot(lambda: None)
     stack.start_bridge(lambda: None)
@@ -192,7 +162,7 @@ def _run(stack: Stack, task: EpisodeTask, tell: Tell) -> RealtimeDrive:
         for pose in tail.update():
             if is_over(drive, pose, task.episode):
                 return drive
-        tell(drive.time_s)
+        on_time(drive.time_s)
         time.sleep(POLL_S)
     return drive
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import platform
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
@@ -11,18 +10,17 @@ from typing import TYPE_CHECKING
 from sim_hil.benchmark.conditions.conditions import ConditionsError
 from sim_hil.benchmark.env.world import EpisodeWorld, WorldOptions
 from sim_hil.benchmark.policies.select import camera_for, open_policy
-from sim_hil.benchmark.results.episode_log import EpisodeLog
-from sim_hil.benchmark.results.record import EpisodeResult
-from sim_hil.benchmark.workers.task import EpisodeTask
+from sim_hil.benchmark.results.record import EpisodeLog, EpisodeResult
+from sim_hil.benchmark.workers.task import EpisodeTask, episode_result
 
 if TYPE_CHECKING:
     from sim_hil.benchmark.results.video import EpisodeVideo
 
-Tell = Callable[[float], None]
+OnTime = Callable[[float], None]
 """Callback that receives the episode's time, s, from time to time."""
 
 
-def run_lockstep(task: EpisodeTask, tell: Tell) -> EpisodeResult:
+def run_lockstep(task: EpisodeTask, on_time: OnTime) -> EpisodeResult:
     """Run an episode in virtual time: the world waits for the policy, so the same task gives identical results."""
     started_ns = time.monotonic_ns()
     episode, log = task.episode, EpisodeLog()
@@ -51,42 +49,15 @@ def run_lockstep(task: EpisodeTask, tell: Tell) -> EpisodeResult:
             if video is not None:
                 video.add(world, observation, command, notes)
             world.step(command)
-            tell(observation.time_s)
+            on_time(observation.time_s)
         outcome, notes = world.outcome(), policy.notes()
         generations = getattr(policy, "generations", lambda: None)()
         log.write(task.log_path, generations or [], world.people(), episode.goal_xy)
         if video is not None and (task.video == "all" or not outcome.success or outcome.collided):
             video.keep()
-        wall_s = (time.monotonic_ns() - started_ns) / 1e9
-        return EpisodeResult(
-            id=episode.id,
-            task=episode.task,
-            scene=episode.scene,
-            people=episode.people,
-            robot=episode.robot,
-            seed=episode.seed,
-            wording=task.conditions.wording,
-            instruction=task.instruction,
-            success=outcome.success,
-            ne_m=outcome.ne_m,
-            spl=100 * outcome.spl,
-            collided=outcome.collided,
-            collisions=outcome.collisions,
-            first_collision_s=outcome.first_collision_s,
-            fell=outcome.fell,
-            end=outcome.end,
-            path_m=outcome.path_m,
-            shortest_m=outcome.shortest_m,
-            time_s=outcome.time_s,
-            timeout_s=episode.timeout_s,
-            trajectory_sha256=outcome.trajectory_sha256,
-            delay_s=log.delay_summary(),
-            generations=None if generations is None else len(generations),
-            stopped_by=str(notes.get("stopped_by", "")),
-            clock=task.conditions.clock,
-            wall_s=round(wall_s, 3),
-            attempts=task.attempt,
-            host=platform.node(),
+        count = None if generations is None else len(generations)
+        return episode_result(
+            task, outcome, log, generations=count, stopped_by=str(notes.get("stopped_by", "")), started_ns=started_ns
         )
 
 
@@ -96,19 +67,22 @@ def _video(task: EpisodeTask) -> EpisodeVideo:
     return EpisodeVideo(task.video_path, task.episode, task.instruction)
 
 
-def _realtime(task: EpisodeTask, tell: Tell) -> EpisodeResult:
+def _realtime(task: EpisodeTask, on_time: OnTime) -> EpisodeResult:
     from sim_hil.benchmark.workers.realtime_episode import run_realtime  # here: it needs nothing of what lockstep does
 
-    return run_realtime(task, tell)
+    return run_realtime(task, on_time)
 
 
-RUNNERS: Mapping[str, Callable[[EpisodeTask, Tell], EpisodeResult]] = {"lockstep": run_lockstep, "realtime": _realtime}
+RUNNERS: Mapping[str, Callable[[EpisodeTask, OnTime], EpisodeResult]] = {
+    "lockstep": run_lockstep,
+    "realtime": _realtime,
+}
 """Function that runs an episode, by clock; all return the same record."""
 
 
-def run_episode(task: EpisodeTask, tell: Tell = lambda _: None) -> EpisodeResult:
+def run_episode(task: EpisodeTask, on_time: OnTime = lambda _: None) -> EpisodeResult:
     """Run one episode on its clock. Raises ConditionsError, ArtifactError, ExternalError, SceneError or OSError."""
     runner = RUNNERS.get(task.conditions.clock)
     if runner is None:
         raise ConditionsError(f"--clock {task.conditions.clock}: not in this version; expected {', '.join(RUNNERS)}")
-    return runner(task, tell)
+    return runner(task, on_time)

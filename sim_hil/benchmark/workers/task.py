@@ -1,13 +1,17 @@
-"""Task of a worker: one episode to run; lightweight, so that a driver need not load the physics."""
+"""Task of a worker: one episode to run, and its record; lightweight, so that a driver need not load the physics."""
 
 from __future__ import annotations
 
+import platform
+import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError
+from sim_hil.benchmark.env.metrics import Outcome
+from sim_hil.benchmark.results.record import EpisodeLog, EpisodeResult
 from sim_hil.benchmark.results.store import EPISODES, VIDEOS
 from sim_hil.benchmark.suite.episode import Episode, SuiteError
 
@@ -65,3 +69,40 @@ class EpisodeTask:
             return EpisodeTask(Episode(**raw), conditions, Path(content["folder"]), **rest)
         except (KeyError, TypeError, AttributeError) as error:
             raise SuiteError(f"task: expected a worker's task as written by edge-bench ({error!r})") from error
+
+
+def episode_result(
+    task: EpisodeTask, outcome: Outcome, log: EpisodeLog, *, generations: int | None, stopped_by: str, started_ns: int
+) -> EpisodeResult:
+    """Return the record of a finished task; `started_ns`: when it began, by time.monotonic_ns."""
+    episode = task.episode
+    return EpisodeResult(
+        id=episode.id,
+        task=episode.task,
+        scene=episode.scene,
+        people=episode.people,
+        robot=episode.robot,
+        seed=episode.seed,
+        wording=task.conditions.wording,
+        instruction=task.instruction,
+        success=outcome.success,
+        ne_m=outcome.ne_m,
+        spl=100 * outcome.spl,
+        collided=outcome.collided,
+        collisions=outcome.collisions,
+        first_collision_s=outcome.first_collision_s,
+        fell=outcome.fell,
+        end=outcome.end,
+        path_m=outcome.path_m,
+        shortest_m=outcome.shortest_m,
+        time_s=outcome.time_s,
+        timeout_s=episode.timeout_s,
+        trajectory_sha256=outcome.trajectory_sha256,
+        delay_s=log.delay_summary(),
+        generations=generations,
+        stopped_by=stopped_by,
+        clock=task.conditions.clock,
+        wall_s=round((time.monotonic_ns() - started_ns) / 1e9, 3),
+        attempts=task.attempt,
+        host=platform.node(),
+    )

@@ -20,16 +20,13 @@ from sim_hil.scene.scene import SceneError
 
 SEND_EVERY_NS = 500_000_000
 
-_BAD_INPUT = (ConditionsError, SuiteError, SceneError, ConfigError, InstructionError)
-
-
-def refusal_of(error: Exception) -> tuple[str, int] | None:
-    """Return message and exit code of an error that a retry cannot fix; None for any other error."""
-    if isinstance(error, ArtifactError):
-        return str(error), EXIT_REFUSED
-    if isinstance(error, _BAD_INPUT):
-        return str(error), EXIT_BAD_INPUT
-    return None
+_BAD_INPUT = (  # no further attempt can succeed
+    ConditionsError,
+    SuiteError,
+    SceneError,
+    ConfigError,
+    InstructionError,
+)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -46,9 +43,10 @@ def main(argv: list[str] | None = None) -> int:
         try:
             task = EpisodeTask.of_json(json.loads(sys.stdin.read()))
             send({"result": run_episode(task, send_time).as_json()})
-        except (ArtifactError, *_BAD_INPUT) as error:
-            line, code = refusal_of(error) or (str(error), EXIT_BAD_INPUT)
-            send({"refused": line, "code": code})
+        except ArtifactError as error:
+            send({"refused": str(error), "code": EXIT_REFUSED})
+        except _BAD_INPUT as error:
+            send({"refused": str(error), "code": EXIT_BAD_INPUT})
         except ExternalError as error:
             # A policy server that is gone or misbehaves: this run has failed, another attempt may not.
             send({"failed": str(error)})

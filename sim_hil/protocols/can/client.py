@@ -8,8 +8,7 @@ from typing import Final
 
 from sim_hil.protocols.can import frames
 from sim_hil.protocols.can.buses import BusLink
-from sim_hil.protocols.can.e2e import COUNTER_PERIOD, Verdict
-from sim_hil.protocols.can.frames import Decoder, Encoder, Received
+from sim_hil.protocols.can.frames import COUNTER_PERIOD, Decoder, Encoder, Received, Verdict
 
 COMMAND_S: Final = 0.02
 HEARTBEAT_S: Final = 0.1

@@ -9,35 +9,31 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any, Final
 
 from firmware_bridge.client_link import check_is_ours
 from firmware_bridge.core.config import ConfigError, runtime_dir
+from sim_hil.protocols.base import CameraFrontEnd, CommandLog
 from sim_hil.protocols.camera_stream import CameraStream
 from sim_hil.protocols.can import frames
 from sim_hil.protocols.can.buses import BusAddress, BusError, BusLink, open_bus
-from sim_hil.protocols.can.e2e import Frame
-from sim_hil.protocols.can.frames import Received
+from sim_hil.protocols.can.frames import Frame, Received
 from sim_hil.protocols.can.node import CanNode
 from sim_hil.protocols.can.pty_line import PtyLine
 from sim_hil.protocols.can.shim import FaultPlan, FaultShim
+from sim_hil.protocols.fault_socket import PlanFaults, parse_plan
 from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, ReceivedCommand
 from sim_hil.robots.carter.body import Carter
 from sim_hil.robots.carter.sensors import CarterSensors, Sensors
 from sim_hil.simulation.physics import Simulation
 
-if TYPE_CHECKING:
-    from sim_hil.protocols.can.faults import CanFaults
-
 CAMERA_PORT: Final = 8090
+SWITCHES: Final = ("button", "bus_off")
 _EVENT_S: Final = 0.1
 _TRACED: Final = {"VelocityCommand": ("Vx", "Wz"), "ModeCommand": ("Request",), "EstopControl": ("Request",)}
+_STOPS: Final = (("EstopControl", frames.ESTOP_STOP), ("ModeCommand", frames.MODE_DISARM))
 
 
 @dataclass(frozen=True)
@@ -65,7 +61,7 @@ class LinkOptions:
             if camera:
                 given["camera_port"] = _port(camera[-1].removeprefix("camera="))
             if faults:
-                given["faults"] = FaultPlan.parse(",".join(faults))
+                given["faults"] = parse_plan(FaultPlan, faults)
             return LinkOptions(BusAddress.parse(where), **given)
         except ValueError as error:
             raise FrontEndError(f"--link {text}: {error}") from error
@@ -90,39 +86,7 @@ def _port(text: str) -> int:
     return int(text)
 
 
-class CommandLog:
-    """Summary of the commands received over the bus, for the result."""
-
-    def __init__(self) -> None:
-        self._commands = 0
-        self._last_move: tuple[float, float, float] | None = None
-        self._last_command: str | None = None
-        self._at_zero = True
-
-    def note(self, received: Received) -> None:
-        """Count one obeyed frame."""
-        self._last_command = received.name
-        if received.name == "VelocityCommand":
-            self._commands += 1
-            self._last_move = (received.signals["Vx"], 0.0, received.signals["Wz"])
-            self._at_zero = not any(self._last_move)
-        elif (received.name, received.signals["Request"]) in (
-            ("EstopControl", frames.ESTOP_STOP),
-            ("ModeCommand", frames.MODE_DISARM),
-        ):
-            self._at_zero = True
-
-    def summary(self) -> dict[str, object]:
-        """Return the `wire` part of the result, without `malformed`."""
-        return {
-            "commands": self._commands,
-            "last_move": None if self._last_move is None else list(self._last_move),
-            "last_command": self._last_command,
-            "last_command_zero": self._at_zero,
-        }
-
-
-class CanFrontEnd:
+class CanFrontEnd(CameraFrontEnd):
     """CAN front end of a simulated Carter."""
 
     def __init__(self, robot: Carter, options: FrontEndOptions, link: LinkOptions, state_length: int) -> None:
@@ -131,7 +95,7 @@ class CanFrontEnd:
         self._node = CanNode(robot)
         self._sensors = CarterSensors(robot, odometry_noise=options.odometry_noise, seed=options.seed)
         self._faulty = link.faults != FaultPlan() or options.faults is not None
-        self._faults: CanFaults | None = None
+        self._faults: PlanFaults[FaultPlan] | None = None
         self._inwards = FaultShim(link.faults, options.seed, 0)
         self._outwards = FaultShim(link.faults, options.seed, 1)
         self._log = CommandLog()
@@ -144,18 +108,10 @@ class CanFrontEnd:
         self._camera: CameraStream | None = None
         try:
             if options.faults is not None:
-                self._faults = _faults(options.faults, link.faults)
+                self._faults = PlanFaults(options.faults, link.faults, SWITCHES)
             self._link = BusLink(open_bus(self._bus_to_open(link.address)))
             if options.camera_size is not None:
-                self._camera = CameraStream(
-                    options.scene_source,
-                    robot=options.robot,
-                    people=options.people,
-                    seed=options.seed,
-                    size=options.camera_size,
-                    port=link.camera_port,
-                    state_length=state_length,
-                )
+                self._camera = CameraStream(options, link.camera_port, state_length)
         except BaseException:
             self.close()
             raise
@@ -183,13 +139,6 @@ class CanFrontEnd:
         """Return the addresses of bus and camera."""
         camera = "no camera" if self._camera is None else f"camera {self._camera.url}"
         return f"CAN {self._address}, {camera}"
-
-    def start(self, render_state: NDArray[np.float64], stop: Sequence[int]) -> bool:
-        """Wait for the camera. Raises CameraProcessError."""
-        if self._camera is None:
-            return True
-        self._camera.show(render_state)
-        return self._camera.wait_ready(stop)
 
     def wait(self, left_ns: int) -> None:
         """Wait until a frame arrives, at most `left_ns`."""
@@ -221,9 +170,17 @@ class CanFrontEnd:
             return
         stop = received.name == "EstopControl" and received.signals.get("Request") == frames.ESTOP_STOP
         if (received.good or stop) and not self._is_repeated(received):
-            self._log.note(received)
+            self._note(received)
             content = " ".join(f"{key}={received.signals[key]:g}" for key in _TRACED[received.name])
             self._commands.append(ReceivedCommand(received_ns, "can", frame.identifier, received.name, content))
+
+    def _note(self, received: Received) -> None:
+        """Count one obeyed frame."""
+        self._log.last_command = received.name
+        if received.name == "VelocityCommand":
+            self._log.move(received.name, (received.signals["Vx"], 0.0, received.signals["Wz"]))
+        elif (received.name, received.signals["Request"]) in _STOPS:
+            self._log.at_zero = True
 
     def _is_repeated(self, received: Received) -> bool:
         """Return whether this frame repeats an event, which is sent three times."""
@@ -254,9 +211,9 @@ class CanFrontEnd:
         if self._faults is None:
             return
         self._faults.poll()
-        self._node.button = self._faults.button
+        self._node.button = "button" in self._faults.active
         for shim in (self._inwards, self._outwards):
-            shim.plan, shim.held_off = self._faults.plan, self._faults.bus_off
+            shim.plan, shim.held_off = self._faults.plan, "bus_off" in self._faults.active
 
     @property
     def pending(self) -> int:
@@ -265,11 +222,6 @@ class CanFrontEnd:
 
     def _read(self) -> Sensors:
         return self._sensors.read(self._now_s)
-
-    def show(self, render_state: NDArray[np.float64]) -> None:
-        """Pass the state to render to the camera process."""
-        if self._camera is not None:
-            self._camera.show(render_state)
 
     def close(self) -> None:
         """End the camera process, close the bus, remove the pty and the fault socket."""
@@ -303,13 +255,6 @@ class CanFrontEnd:
             "video_frames": 0 if self._camera is None else self._camera.pictures,
             "states": self._states,
         }
-
-
-def _faults(path: Path, plan: FaultPlan) -> CanFaults:
-    # Imported here: needed only with --faults.
-    from sim_hil.protocols.can.faults import CanFaults
-
-    return CanFaults(path, plan)
 
 
 _MOTION_ID: Final = frames.database().get_message_by_name("OdometryMotion").frame_id

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final
 
 from edge.core.geometry import wrap_angle
+from sim_hil.protocols.base import Base
 from sim_hil.protocols.can import frames
-from sim_hil.protocols.can.e2e import Frame, Verdict
-from sim_hil.protocols.can.frames import Decoder, Encoder, Received
+from sim_hil.protocols.can.frames import Decoder, Encoder, Frame, Received, Verdict
 from sim_hil.robots.carter.sensors import Sensors
 
 COMMAND_TIMEOUT_S: Final = 0.100
@@ -29,35 +29,6 @@ ERROR_RESTARTED: Final = 0x100
 _TICK_S: Final = 1e-6  # tolerance for the rounding error of summed steps
 _LEVELS: Final = ("CommandTimeout", "HeartbeatLost", "BatteryLow", "DriveOverload")
 _SIDES: Final = ("Front", "Rear", "Left", "Right")
-
-
-class Base(Protocol):
-    """Interface of the robot to the node."""
-
-    @property
-    def ready(self) -> bool:
-        """Whether the robot would obey a velocity."""
-        ...
-
-    def command(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
-        """Set the commanded velocity."""
-        ...
-
-    def stand(self) -> None:
-        """Power the drive on."""
-        ...
-
-    def rest(self) -> None:
-        """Brake, then power the drive off."""
-        ...
-
-    def press_estop(self) -> None:
-        """Brake hard."""
-        ...
-
-    def release_estop(self) -> None:
-        """Allow the drive to be powered again."""
-        ...
 
 
 @dataclass

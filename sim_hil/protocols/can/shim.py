@@ -7,14 +7,13 @@ duration of a fault depends on the clock.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from math import isfinite
 from typing import Final
 
 import numpy as np
 
-from sim_hil.protocols.can.e2e import Frame
+from sim_hil.protocols.can.frames import Frame
 from sim_hil.protocols.can.node import ERROR_BUS_OFF, ERROR_RESTARTED
 
 # A frame of 8 bytes with its stuff bits, about 130 bits, on a bus of 500 kbit/s.
@@ -51,21 +50,6 @@ class FaultPlan:
         if 0.0 < self.bus_off_every_s <= self.bus_off_s:
             raise ValueError(f"CAN fault bus_off_every_s: expected more than bus_off_s, found {self.bus_off_every_s}")
 
-    @staticmethod
-    def parse(text: str) -> FaultPlan:
-        """Parse `drop=0.1,corrupt=0.05`. Raises ValueError with one line."""
-        known = {each.name for each in fields(FaultPlan)}
-        values: dict[str, float] = {}
-        for part in text.split(","):
-            name, equals, number = part.partition("=")
-            if not equals or name not in known:
-                raise ValueError(f"CAN faults: expected NAME=NUMBER of {', '.join(sorted(known))}, found {part!r}")
-            try:
-                values[name] = float(number)
-            except ValueError:
-                raise ValueError(f"CAN faults: {name}: expected a number, found {number!r}") from None
-        return FaultPlan(**values)
-
 
 class FaultShim:
     """One direction of a faulty bus: `put` frames in and `take` the arriving ones, with a monotonic clock."""
@@ -84,12 +68,6 @@ class FaultShim:
         self._babbled_until_s: float | None = None  # None: not babbling
         self._off = False
         self._last_take_s = 0.0
-        self._done = dict.fromkeys(("drop", "corrupt", "duplicate", "delay", "bus_off", "babble", "starved"), 0)
-
-    @property
-    def done(self) -> Mapping[str, int]:
-        """Number of occurrences of each fault."""
-        return dict(self._done)
 
     def put(self, frame: Frame, now_s: float) -> None:
         """Send a frame."""
@@ -100,7 +78,6 @@ class FaultShim:
         if self.is_off(now_s):
             return
         if drop < plan.drop:
-            self._done["drop"] += 1
             return
         if corrupt < plan.corrupt and frame.data:
             frame = self._corrupted(frame, bits.tolist())
@@ -108,15 +85,12 @@ class FaultShim:
         if arrives_s is None:
             return
         if delay < plan.delay:
-            self._done["delay"] += 1
             arrives_s += plan.delay_s
         self._queue(frame, arrives_s)
         if duplicate < plan.duplicate:
-            self._done["duplicate"] += 1
             self._queue(frame, arrives_s)
 
     def _corrupted(self, frame: Frame, bits: list[int]) -> Frame:
-        self._done["corrupt"] += 1
         data = bytearray(frame.data)
         for bit in set(bits):
             data[bit // 8] ^= 1 << bit % 8
@@ -129,7 +103,6 @@ class FaultShim:
             return now_s
         share = plan.babble_hz * FRAME_S
         if share >= 1.0:
-            self._done["starved"] += 1
             return None
         self._free_s = max(self._free_s, now_s) + FRAME_S / (1.0 - share)
         return self._free_s
@@ -164,7 +137,6 @@ class FaultShim:
         if off == self._off:
             return []
         self._off = off
-        self._done["bus_off"] += off
         return [Frame(ERROR_BUS_OFF if off else ERROR_RESTARTED, bytes(8), error=True)]
 
     def _babble(self, now_s: float) -> list[Frame]:
@@ -177,5 +149,4 @@ class FaultShim:
         period_s = max(1 / self.plan.babble_hz, FRAME_S)
         count = int((now_s - self._babbled_until_s) / period_s + 1e-9)
         self._babbled_until_s += count * period_s
-        self._done["babble"] += count
         return [Frame(BABBLER_ID, bytes(8))] * count

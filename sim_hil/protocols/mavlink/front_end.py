@@ -1,38 +1,39 @@
 """MAVLink front end of `edge-hil`: the Carter as a rover on UDP, with its camera over HTTP.
 
---link udp:HOST:PORT[,to=HOST:PORT...][,camera=PORT][,system=NUMBER][,key=FILE], for example
+--link udp:HOST:PORT[,to=HOST:PORT...][,camera=PORT][,system=NUMBER][,key=FILE][,IMPAIRMENT=NUMBER...], for example
   udp:127.0.0.1:14580,to=127.0.0.1:14540,to=127.0.0.1:14550    the default: heartbeats to the ports of MAVSDK and of
                                                                 ground stations; a station that answers gets all reports
   udp:127.0.0.1:14580,key=signing.hex    unsigned packets are ignored, all sent packets are signed
+  udp:127.0.0.1:14580,loss_percent=30,jitter_ms=200    a radio that loses and delays packets (`udp.Impairment`)
+
+`--faults PATH` accepts the impairment's fields, "button" (emergency stop button pressed) and "mute" (nothing is
+received or sent).
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
 from pymavlink.dialects.v20 import common
 
+from sim_hil.protocols.base import CameraFrontEnd, CommandLog
 from sim_hil.protocols.camera_stream import CameraStream
+from sim_hil.protocols.fault_socket import PlanFaults, parse_plan, plan_fields
 from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, ReceivedCommand
-from sim_hil.protocols.mavlink.commands import Command
-from sim_hil.protocols.mavlink.faults import MavlinkFaults
-from sim_hil.protocols.mavlink.node import COMPONENT, MavlinkNode
+from sim_hil.protocols.mavlink.node import COMPONENT, Command, MavlinkNode
 from sim_hil.protocols.mavlink.parameters import Parameters
-from sim_hil.protocols.mavlink.signing import Verifier, read_key
-from sim_hil.protocols.mavlink.udp import Address, UdpLink, parse_address
+from sim_hil.protocols.mavlink.udp import PERFECT, Address, Impairment, UdpLink, parse_address
 from sim_hil.protocols.mavlink.vehicle import Station
-from sim_hil.protocols.mavlink.wire import Message, Reader, Writer, now_ticks
+from sim_hil.protocols.mavlink.wire import Message, Reader, Verifier, Writer, now_ticks, read_key
 from sim_hil.robots.carter.body import Carter
 from sim_hil.robots.carter.sensors import CarterSensors, Sensors
 from sim_hil.simulation.physics import Simulation
 
 CAMERA_PORT: Final = 8090
+SWITCHES: Final = ("button", "mute")
 DEFAULT_LINK: Final = "udp:127.0.0.1:14580,to=127.0.0.1:14540,to=127.0.0.1:14550"
 
 _NOT_TRACED: Final = ("mavpackettype", "target_system", "target_component", "time_boot_ms", "command", "confirmation")
@@ -47,6 +48,7 @@ class LinkOptions:
     camera_port: int = CAMERA_PORT
     system: int = 1
     key: bytes | None = None
+    impairment: Impairment = PERFECT
 
     def __post_init__(self) -> None:
         if not 0 <= self.camera_port <= 65535:
@@ -61,6 +63,7 @@ class LinkOptions:
         where, *settings = text.split(",")
         given: dict[str, Any] = {}
         to: list[Address] = []
+        faults: list[str] = []
         try:
             if not where.startswith("udp:"):
                 raise ValueError(f"expected udp:HOST:PORT, found {where!r}")
@@ -74,8 +77,11 @@ class LinkOptions:
                     given["system"] = _number(name, value)
                 elif name == "key":
                     given["key"] = read_key(Path(value))
+                elif name in plan_fields(Impairment):
+                    faults.append(setting)
                 else:
-                    raise ValueError(f"expected to=, camera=, system= or key=, found {setting!r}")
+                    raise ValueError(f"expected to=, camera=, system=, key= or an impairment, found {setting!r}")
+            given["impairment"] = parse_plan(Impairment, faults)
             return LinkOptions(parse_address(where.removeprefix("udp:")), tuple(to), **given)
         except (ValueError, OSError) as error:
             raise FrontEndError(f"--link {text}: {error}") from error
@@ -87,34 +93,7 @@ def _number(name: str, text: str) -> int:
     return int(text)
 
 
-class CommandLog:
-    """Summary of the obeyed commands in the base's axes, for the result."""
-
-    def __init__(self) -> None:
-        self._commands = 0
-        self._last_move: tuple[float, float, float] | None = None
-        self._last_command: str | None = None
-        self._at_zero = True
-
-    def note(self, name: str, wanted: tuple[float, float] | None, *, moves: bool) -> None:
-        """Count one message; `wanted`: resulting command (vx m/s, wz rad/s), None: no command."""
-        self._last_command = name
-        if moves and wanted is not None:
-            self._commands += 1
-            self._last_move = (wanted[0], 0.0, wanted[1])
-        self._at_zero = wanted is None or not any(wanted)
-
-    def summary(self) -> dict[str, object]:
-        """Return the `wire` part of the result, without `malformed`."""
-        return {
-            "commands": self._commands,
-            "last_move": None if self._last_move is None else list(self._last_move),
-            "last_command": self._last_command,
-            "last_command_zero": self._at_zero,
-        }
-
-
-class MavlinkFrontEnd:
+class MavlinkFrontEnd(CameraFrontEnd):
     """MAVLink front end of a simulated Carter."""
 
     def __init__(self, robot: Carter, options: FrontEndOptions, link: LinkOptions, state_length: int) -> None:
@@ -129,22 +108,14 @@ class MavlinkFrontEnd:
         self._now_s = 0.0
         self._states = 0
         self._camera: CameraStream | None = None
-        self._faults: MavlinkFaults | None = None
-        self._link = UdpLink(link.bind, link.to)
+        self._faults: PlanFaults[Impairment] | None = None
+        self._link = UdpLink(link.bind, link.to, link.impairment, options.seed)
         self._host = link.bind[0]
         try:
             if options.faults is not None:
-                self._faults = MavlinkFaults(options.faults)
+                self._faults = PlanFaults(options.faults, link.impairment, SWITCHES)
             if options.camera_size is not None:
-                self._camera = CameraStream(
-                    options.scene_source,
-                    robot=options.robot,
-                    people=options.people,
-                    seed=options.seed,
-                    size=options.camera_size,
-                    port=link.camera_port,
-                    state_length=state_length,
-                )
+                self._camera = CameraStream(options, link.camera_port, state_length)
         except BaseException:
             self.close()
             raise
@@ -159,13 +130,6 @@ class MavlinkFrontEnd:
         camera = "no camera" if self._camera is None else f"camera {self._camera.url}"
         return f"MAVLink udp:{self._host}:{self._link.port}, system {self._node.system}, {camera}"
 
-    def start(self, render_state: NDArray[np.float64], stop: Sequence[int]) -> bool:
-        """Wait for the camera. Raises CameraProcessError."""
-        if self._camera is None:
-            return True
-        self._camera.show(render_state)
-        return self._camera.wait_ready(stop)
-
     def wait(self, left_ns: int) -> None:
         """Wait until a datagram arrives, at most `left_ns`."""
         self._link.wait(left_ns)
@@ -173,7 +137,7 @@ class MavlinkFrontEnd:
     def serve(self) -> list[ReceivedCommand]:
         """Execute and answer the received commands and return them."""
         commands: list[ReceivedCommand] = []
-        for data, address in self._link.receive():
+        for data, address in self._link.receive(self._now_s):
             if self._muted:
                 continue
             received_ns = time.monotonic_ns()
@@ -195,7 +159,11 @@ class MavlinkFrontEnd:
         if name.startswith("COMMAND"):
             command = Command.of(message)
             number, name = command.number, common.enums["MAV_CMD"][command.number].name
-        self._log.note(name, self._node.vehicle.wanted() if self._node.vehicle.armed else None, moves=moves)
+        wanted = self._node.vehicle.wanted() if self._node.vehicle.armed else None
+        self._log.last_command = name
+        if moves and wanted is not None:
+            self._log.move(name, (wanted[0], 0.0, wanted[1]))
+        self._log.at_zero = wanted is None or not any(wanted)
         content = " ".join(
             f"{key}={value}"
             for key, value in message.to_dict().items()
@@ -208,7 +176,8 @@ class MavlinkFrontEnd:
         self._now_s = stamp_s
         if self._faults is not None:
             self._faults.poll()
-            self._node.vehicle.button = self._faults.button
+            self._node.vehicle.button = "button" in self._faults.active
+            self._link.impairment = self._faults.plan
         self._node.step(stamp_s)
         self._flush(self._node.due(stamp_s))
 
@@ -223,15 +192,10 @@ class MavlinkFrontEnd:
 
     @property
     def _muted(self) -> bool:
-        return self._faults is not None and self._faults.mute
+        return self._faults is not None and "mute" in self._faults.active
 
     def _read(self) -> Sensors:
         return self._sensors.read(self._now_s)
-
-    def show(self, render_state: NDArray[np.float64]) -> None:
-        """Pass the state to render to the camera process."""
-        if self._camera is not None:
-            self._camera.show(render_state)
 
     def close(self) -> None:
         """End the camera process and close the sockets."""

@@ -1,4 +1,4 @@
-"""MAVLink component of the rover: handles messages, produces answers and due reports. Pure: no network.
+"""MAVLink component of the rover: handles messages and commands, produces answers and reports. Pure: no network.
 
 All messages go to all listeners, as on a shared radio; an acknowledgement contains its addressee.
 """
@@ -6,21 +6,31 @@ All messages go to all listeners, as on a shared radio; an acknowledgement conta
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from math import isfinite, isnan
 from types import MappingProxyType
 from typing import Final
 
 from pymavlink.dialects.v20 import common
 
-from sim_hil.protocols.mavlink import commands, parameters, telemetry
-from sim_hil.protocols.mavlink.commands import Command
-from sim_hil.protocols.mavlink.estimator import TiltFilter
-from sim_hil.protocols.mavlink.modes import custom_mode_of
+from sim_hil.protocols.base import Base
+from sim_hil.protocols.mavlink import parameters, telemetry
 from sim_hil.protocols.mavlink.parameters import Parameters
 from sim_hil.protocols.mavlink.setpoints import SetpointError, Sticks, manual_sticks, override_sticks, read_setpoint
-from sim_hil.protocols.mavlink.vehicle import Base, Health, Station, Vehicle
+from sim_hil.protocols.mavlink.vehicle import (
+    ACCEPTED,
+    DENIED,
+    Health,
+    Station,
+    Vehicle,
+    custom_mode_of,
+    find_mode,
+)
 from sim_hil.protocols.mavlink.wire import Counts, Message
 from sim_hil.robots.carter.sensors import Sensors
 
+FORCE: Final = 21196  # param2 of an arm or disarm command that skips checks (mavlink.io, MAV_CMD 400)
+UNSUPPORTED: Final = int(common.MAV_RESULT_UNSUPPORTED)
 COMPONENT: Final = common.MAV_COMP_ID_AUTOPILOT1
 READ_S: Final = 1 / telemetry.MAX_HZ
 _TEXT_BYTES: Final = 50
@@ -28,6 +38,27 @@ _FTP_NAK: Final = 129
 _FTP_FILE_NOT_FOUND: Final = 10
 _MAX_WAITING_PARAMETERS: Final = 2 * len(parameters.NAMES)
 _PARAMETERS_A_STEP: Final = 2  # parameters sent per step, so that a list does not become a burst
+
+
+@dataclass(frozen=True)
+class Command:
+    """One received command; `params` are param1..param7, where COMMAND_INT has x and y.
+
+    NaN marks an unused parameter (MAVSDK sends it); it is read as 0.
+    """
+
+    number: int
+    params: tuple[float, ...]
+
+    @staticmethod
+    def of(message: Message) -> Command:
+        """Read a COMMAND_LONG or COMMAND_INT."""
+        params = [message.param1, message.param2, message.param3, message.param4]
+        if message.get_msgId() == common.MAVLINK_MSG_ID_COMMAND_INT:
+            params += [message.x, message.y, message.z]
+        else:
+            params += [message.param5, message.param6, message.param7]
+        return Command(message.command, tuple(0.0 if isnan(value) else value for value in params))
 
 
 class MavlinkNode:
@@ -42,7 +73,7 @@ class MavlinkNode:
         self.schedule = telemetry.Schedule()
         self.counts = counts
         self._read = read
-        self._tilt = TiltFilter()
+        self._tilt = telemetry.TiltFilter()
         self._sensors: Sensors | None = None
         self._now_s = self._stamp_s = 0.0
         self._next_read_s = 0.0
@@ -144,7 +175,8 @@ class MavlinkNode:
 
     def _command(self, message: Message, station: Station, now_s: float) -> bool:
         command = Command.of(message)
-        result = commands.obey(self, station, command, now_s)
+        handler = COMMANDS.get(command.number)
+        result = UNSUPPORTED if handler is None else handler(self, station, command, now_s)
         self.answer(
             common.MAVLink_command_ack_message(
                 command.number, result, 255, 0, message.get_srcSystem(), message.get_srcComponent()
@@ -244,6 +276,77 @@ class MavlinkNode:
         return False
 
 
+def _arm_disarm(node: MavlinkNode, station: Station, command: Command, now_s: float) -> int:
+    arm, force = command.params[:2]
+    if arm not in (0, 1) or force not in (0, FORCE):
+        return int(DENIED)
+    if arm:
+        return node.vehicle.arm(station, now_s, forced=force == FORCE)
+    if force:
+        return node.vehicle.emergency_stop(f"forced disarm by station {station.system}")
+    return node.vehicle.disarm(station, now_s)
+
+
+def _terminate(node: MavlinkNode, station: Station, command: Command, now_s: float) -> int:
+    if command.params[0] >= 0.5:
+        return node.vehicle.emergency_stop(f"termination by station {station.system}")
+    return int(DENIED)
+
+
+def _set_mode(node: MavlinkNode, station: Station, command: Command, now_s: float) -> int:
+    base, main, sub = command.params[:3]
+    if not all(map(isfinite, (base, main, sub))) or not int(base) & common.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
+        return node.vehicle.set_mode(station, None, now_s)
+    return node.vehicle.set_mode(station, find_mode(int(main), int(sub)), now_s)
+
+
+def _set_interval(node: MavlinkNode, station: Station, command: Command, now_s: float) -> int:
+    number, interval_us = command.params[:2]
+    if not (isfinite(number) and isfinite(interval_us)) or not node.vehicle.may_change(station, now_s):
+        return int(DENIED)
+    return int(ACCEPTED if node.schedule.set_interval(int(number), interval_us, now_s) else DENIED)
+
+
+def _get_interval(node: MavlinkNode, station: Station, command: Command, now_s: float) -> int:
+    number = command.params[0]
+    interval_us = node.schedule.interval_us(int(number)) if isfinite(number) else None
+    if interval_us is None:
+        return int(DENIED)
+    node.send_after_ack(common.MAVLink_message_interval_message(int(number), interval_us))
+    return int(ACCEPTED)
+
+
+def _request(node: MavlinkNode, station: Station, command: Command, now_s: float) -> int:
+    number = command.params[0]
+    return _send(node, int(number)) if isfinite(number) else int(DENIED)
+
+
+def _send(node: MavlinkNode, number: int) -> int:
+    if number == common.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
+        node.send_after_ack(telemetry.autopilot_version(node.system))
+    elif number in telemetry.STREAMS:
+        node.send_after_ack(telemetry.STREAMS[number].make(node.snapshot()))
+    else:
+        return int(DENIED)
+    return int(ACCEPTED)
+
+
+CommandHandler = Callable[[MavlinkNode, Station, Command, float], int]
+COMMANDS: Final[Mapping[int, CommandHandler]] = MappingProxyType(
+    {
+        common.MAV_CMD_COMPONENT_ARM_DISARM: _arm_disarm,
+        common.MAV_CMD_DO_SET_MODE: _set_mode,
+        common.MAV_CMD_DO_FLIGHTTERMINATION: _terminate,
+        common.MAV_CMD_SET_MESSAGE_INTERVAL: _set_interval,
+        common.MAV_CMD_GET_MESSAGE_INTERVAL: _get_interval,
+        common.MAV_CMD_REQUEST_MESSAGE: _request,
+        common.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: lambda node, *_: _send(
+            node, common.MAVLINK_MSG_ID_AUTOPILOT_VERSION
+        ),
+        common.MAV_CMD_GET_HOME_POSITION: lambda node, *_: _send(node, common.MAVLINK_MSG_ID_HOME_POSITION),
+    }
+)
+"""Handlers of COMMAND_LONG and COMMAND_INT; every other command is acknowledged as unsupported."""
 _MOVING: Final = (
     common.MAV_CMD_COMPONENT_ARM_DISARM,
     common.MAV_CMD_DO_SET_MODE,

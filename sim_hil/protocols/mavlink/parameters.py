@@ -13,7 +13,6 @@ from pymavlink.dialects.v20 import common
 
 from sim_hil.protocols.mavlink.wire import Message
 
-NAME_BYTES: Final = 16
 _INT: Final = common.MAV_PARAM_TYPE_INT32
 _REAL: Final = common.MAV_PARAM_TYPE_REAL32
 

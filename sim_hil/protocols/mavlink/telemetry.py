@@ -1,4 +1,4 @@
-"""Telemetry of the rover: one function per message, and a schedule with rates that a station may change.
+"""Telemetry of the rover: one function per message, a tilt filter, and a schedule with rates that a station may change.
 
 The local frame is the base's pose at switch-on: "north" is its heading, east is to its right, z points down. There is
 no GPS: latitude and longitude are computed from the local position and an invented origin.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from math import cos, hypot, pi, radians, sin
+from math import atan2, cos, exp, hypot, pi, radians, sin, tan
 from types import MappingProxyType
 from typing import Final
 
@@ -18,9 +18,9 @@ from edge.core.geometry import wrap_angle
 from sim_hil.protocols.mavlink.setpoints import heading_degrees
 from sim_hil.protocols.mavlink.vehicle import Vehicle
 from sim_hil.protocols.mavlink.wire import Message
+from sim_hil.robots.carter.drive import COUNTS_PER_TURN
 from sim_hil.robots.carter.sensors import Sensors
 from sim_hil.robots.carter.urdf import WHEEL_RADIUS_M
-from sim_hil.robots.carter.wheel_odometry import COUNTS_PER_TURN
 
 MAX_HZ: Final = 50.0  # rate of sensor readings
 # Same origin as in PX4's simulation, a place that users recognise as simulated.
@@ -28,6 +28,7 @@ ORIGIN_LATITUDE_DEG: Final = 47.397742
 ORIGIN_LONGITUDE_DEG: Final = 8.545594
 ORIGIN_ALTITUDE_M: Final = 488.0
 _EARTH_RADIUS_M: Final = 6_371_000.0
+_TIME_CONSTANT_S: Final = 1.5  # our choice: longer than the base's acceleration phases
 _NAN: Final = float("nan")
 _SENSORS: Final = (
     common.MAV_SYS_STATUS_SENSOR_3D_GYRO
@@ -257,6 +258,31 @@ STREAMS: Final[Mapping[int, Stream]] = MappingProxyType(
         common.MAVLINK_MSG_ID_HOME_POSITION: Stream(_home, 0.0),
     }
 )
+
+
+class TiltFilter:
+    """Complementary filter in the base's axes: x forward, y left, z up."""
+
+    def __init__(self) -> None:
+        self.roll_rad = self.pitch_rad = 0.0
+        self._last_s: float | None = None
+
+    def step(self, time_s: float, gyro_radps: tuple[float, ...], accel_mps2: tuple[float, ...]) -> None:
+        """Add a sensor reading; times must not decrease."""
+        ax, ay, az = accel_mps2
+        roll, pitch = atan2(ay, az), atan2(-ax, hypot(ay, az))
+        if self._last_s is None:
+            self.roll_rad, self.pitch_rad = roll, pitch
+        else:
+            elapsed_s = time_s - self._last_s
+            share = 1 - exp(-elapsed_s / _TIME_CONSTANT_S)
+            wx, wy, wz = gyro_radps
+            turn = wy * sin(self.roll_rad) + wz * cos(self.roll_rad)
+            self.roll_rad += elapsed_s * (wx + tan(max(-1.4, min(1.4, self.pitch_rad))) * turn)  # a base on its side
+            self.pitch_rad += elapsed_s * (wy * cos(self.roll_rad) - wz * sin(self.roll_rad))
+            self.roll_rad += share * (roll - self.roll_rad)
+            self.pitch_rad += share * (pitch - self.pitch_rad)
+        self._last_s = time_s
 
 
 class Schedule:

@@ -1,20 +1,63 @@
 """State machine of the rover: control by one station, modes, arming, failsafes. Pure: no clock, no network.
 
 All times are the robot's own clock, s. One station is in control: the first that sends a request related to motion. It
-stays in control until it disarms the base or falls silent. Every station may receive reports and stop the base.
+stays in control until it disarms the base or falls silent. Every station may receive reports and stop the base. The
+modes have PX4's numbers (px4_custom_mode.h).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 from math import degrees, radians
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
 from pymavlink.dialects.v20 import common
 
-from sim_hil.protocols.mavlink.modes import Mode
+from sim_hil.protocols.base import Base
 from sim_hil.protocols.mavlink.parameters import Parameters
 from sim_hil.protocols.mavlink.setpoints import Setpoint, Sticks
+
+_MAIN_SHIFT: Final = 16
+_SUB_SHIFT: Final = 24
+
+
+class Mode(Enum):
+    """Mode of the rover; the value is PX4's (main mode, sub mode)."""
+
+    MANUAL = (1, 0)
+    HOLD = (4, 3)  # AUTO, LOITER
+    OFFBOARD = (6, 0)
+
+    @property
+    def custom_mode(self) -> int:
+        """Value of a heartbeat's `custom_mode`."""
+        main, sub = self.value
+        return int(main) << _MAIN_SHIFT | int(sub) << _SUB_SHIFT
+
+    @property
+    def base_flags(self) -> int:
+        """Bits of a heartbeat's `base_mode` for this mode."""
+        flags = {
+            Mode.MANUAL: common.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED,
+            Mode.HOLD: common.MAV_MODE_FLAG_AUTO_ENABLED | common.MAV_MODE_FLAG_GUIDED_ENABLED,
+            Mode.OFFBOARD: common.MAV_MODE_FLAG_GUIDED_ENABLED,
+        }
+        return int(common.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | flags[self])
+
+
+def find_mode(main: int, sub: int) -> Mode | None:
+    """Return the mode of a main and a sub mode; sub mode 0 selects the main mode's only one. None if unknown."""
+    for mode in Mode:
+        if mode.value[0] == main and sub in (0, mode.value[1]):
+            return mode
+    return None
+
+
+def custom_mode_of(value: int) -> Mode | None:
+    """Return the mode of a `custom_mode` value; None if unknown."""
+    return find_mode(value >> _MAIN_SHIFT & 0xFF, value >> _SUB_SHIFT & 0xFF)
+
 
 _COMMAND_S: Final = 0.02  # period at which a setpoint in the local frame is converted to the base's frame
 _STOP: Final = (0.0, 0.0, 0.0)
@@ -26,30 +69,6 @@ REJECTED: Final[int] = common.MAV_RESULT_TEMPORARILY_REJECTED
 DENIED: Final[int] = common.MAV_RESULT_DENIED
 FAILED: Final[int] = common.MAV_RESULT_FAILED
 _MAX_TEXTS: Final = 20
-
-
-class Base(Protocol):
-    """Interface of the robot to the vehicle."""
-
-    def command(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
-        """Set the commanded velocity."""
-        ...
-
-    def stand(self) -> None:
-        """Power the drive on."""
-        ...
-
-    def rest(self) -> None:
-        """Brake, then power the drive off."""
-        ...
-
-    def press_estop(self) -> None:
-        """Brake hard."""
-        ...
-
-    def release_estop(self) -> None:
-        """Allow the drive to be powered again."""
-        ...
 
 
 class Station(NamedTuple):

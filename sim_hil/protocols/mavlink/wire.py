@@ -1,18 +1,19 @@
-"""MAVLink packets in datagrams: encoding, decoding, and counts of invalid input. Pure.
+"""MAVLink packets in datagrams: encoding, decoding, signatures, and counts of invalid input. Pure.
 
 The dialect is pymavlink's `common`, version 2; packets of version 1 are accepted and answered in version 2.
 """
 
 from __future__ import annotations
 
+import hashlib
+import hmac
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 from pymavlink.dialects.v20 import common
-
-from sim_hil.protocols.mavlink.signing import BLOCK_BYTES, EPOCH_UNIX_S, TICKS_PER_S, Verifier
 
 Message = Any
 """One of pymavlink's message objects: fields as attributes, `get_msgId()`, `get_srcSystem()`."""
@@ -22,6 +23,11 @@ _V1_HEADER: Final = 6
 _V2_HEADER: Final = 10
 _CRC: Final = 2
 _SIGNED_FLAG: Final = 0x01
+KEY_BYTES: Final = 32
+BLOCK_BYTES: Final = 13  # link id, timestamp 48 bits, signature 48 bits
+TICKS_PER_S: Final = 100_000  # unit of the timestamp: 10 us since 1 January 2015
+EPOCH_UNIX_S: Final = 1_420_070_400
+_NEW_STREAM_BEHIND: Final = 60 * TICKS_PER_S
 # Messages of other dialects are valid, so they are counted separately.
 _UNKNOWN: Final = common.MAVLink_unknown
 
@@ -113,3 +119,49 @@ class Writer:
 def now_ticks() -> int:
     """Return the current time as a signature timestamp; the only use of wall-clock time, required by the protocol."""
     return (time.time_ns() - EPOCH_UNIX_S * 1_000_000_000) * TICKS_PER_S // 1_000_000_000
+
+
+def read_key(path: Path) -> bytes:
+    """Read the secret key, 64 hexadecimal digits in a file. Raises ValueError or OSError."""
+    text = path.read_text(encoding="ascii").strip()
+    try:
+        key = bytes.fromhex(text)
+    except ValueError:
+        key = b""
+    if len(key) != KEY_BYTES:
+        raise ValueError(f"{path}: expected {2 * KEY_BYTES} hexadecimal digits, found {len(text)} characters")
+    return key
+
+
+def signature(key: bytes, packet: bytes) -> bytes:
+    """Return the signature of a packet, its last 6 bytes, computed over everything before them."""
+    return hashlib.sha256(key + packet).digest()[:6]
+
+
+class Verifier:
+    """Verifier of signed packets of all streams; a stream is (link id, system, component).
+
+    A timestamp is stored only after the signature is verified (mavlink.io, "Message Signing"): pymavlink's own check
+    stores it first, so that a forged packet from the future makes genuine packets look old.
+    """
+
+    def __init__(self, key: bytes, now_ticks: int) -> None:
+        """Create a verifier; `now_ticks`: current time as a timestamp, for checking new streams."""
+        self._key = key
+        self.timestamp = now_ticks
+        self._streams: dict[tuple[int, int, int], int] = {}
+
+    def accepts(self, packet: bytes) -> bool:
+        """Return whether a complete MAVLink 2 packet is signed with the key and newer than the last of its stream."""
+        if not packet[2] & _SIGNED_FLAG:
+            return False
+        block = packet[-BLOCK_BYTES:]
+        if not hmac.compare_digest(signature(self._key, packet[:-6]), block[7:]):
+            return False
+        stream, timestamp = (block[0], packet[5], packet[6]), int.from_bytes(block[1:7], "little")
+        last = self._streams.get(stream, self.timestamp - _NEW_STREAM_BEHIND - 1)
+        if timestamp <= last:
+            return False
+        self._streams[stream] = timestamp
+        self.timestamp = max(self.timestamp, timestamp)
+        return True

@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_hil.protocols.render_process import encode_jpeg
 from sim_hil.protocols.unitree.fault_commands import CLEAR, FaultCommand, FaultCommandError, parse
 from sim_hil.protocols.unitree.services.service import Received, ServiceServer
-from sim_hil.protocols.unitree.video_service import VideoHub, encode_jpeg
+from sim_hil.protocols.unitree.video_service import VideoHub
 from sim_hil.simulation.sensor_noise import SensorNoise
 
 _HISTORY_NS: Final = 5_000_000_000
@@ -30,19 +31,19 @@ class FaultyVideoHub(VideoHub):
         self,
         server: ServiceServer,
         render: Callable[[], bytes | None],
-        tell: Callable[[dict[str, object]], None],
+        report: Callable[[dict[str, object]], None],
         *,
         size: tuple[int, int],
         commands_fd: int,
     ) -> None:
         """Create the service; `size`: image size (width, height), px; `commands_fd`: descriptor of the commands."""
-        super().__init__(server, render, tell)
+        super().__init__(server, render, report)
         self._size = size
         self._fd = commands_fd
         os.set_blocking(commands_fd, False)
         self._partial = b""
         self._on: dict[str, FaultCommand] = {}
-        self._untold: set[str] = set()
+        self._unreported: set[str] = set()
         self._held: list[Received] = []
         self._due: deque[tuple[int, Received, bytes]] = deque()
         self._history: deque[tuple[int, bytes]] = deque()
@@ -71,27 +72,27 @@ class FaultyVideoHub(VideoHub):
     def _switch(self, command: FaultCommand) -> None:
         if command.fault == CLEAR:
             self._on.clear()
-            self._untold.clear()
+            self._unreported.clear()
             self._thaw()
         elif command.on:
             self._on[command.fault] = command
-            self._untold.add(command.fault)
+            self._unreported.add(command.fault)
             self._thaw()
             if command.fault == "camera-stop":  # takes effect at once: no answer from now on
                 self._took_effect()
         else:
             self._on.pop(command.fault, None)
-            self._untold.discard(command.fault)
-            self._tell({"event": "fault", "fault": command.fault, "t_ns": time.monotonic_ns()})
+            self._unreported.discard(command.fault)
+            self._report({"event": "fault", "fault": command.fault, "t_ns": time.monotonic_ns()})
 
     def _thaw(self) -> None:
         self._frozen = None
         self._stale.clear()
 
     def _took_effect(self) -> None:
-        for name in sorted(self._untold):
-            self._tell({"event": "fault", "fault": name, "t_ns": time.monotonic_ns()})
-        self._untold.clear()
+        for name in sorted(self._unreported):
+            self._report({"event": "fault", "fault": name, "t_ns": time.monotonic_ns()})
+        self._unreported.clear()
 
     def _answer(self, waiting: list[Received]) -> None:
         now_ns = time.monotonic_ns()

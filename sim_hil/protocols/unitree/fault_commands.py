@@ -34,9 +34,9 @@ class FaultKind:
     once: bool = False
 
 
-def _kinds() -> dict[str, FaultKind]:
-    seconds = (0.0, 60.0)
-    return {
+_SECONDS: Final = (0.0, 60.0)
+KINDS: Final[Mapping[str, FaultKind]] = MappingProxyType(
+    {
         "camera-stop": FaultKind("camera", "requests for an image are never answered"),
         "camera-freeze": FaultKind("camera", "every answer repeats the first image since then"),
         "camera-stale-buffers": FaultKind(
@@ -48,8 +48,8 @@ def _kinds() -> dict[str, FaultKind]:
         "camera-frozen-noise": FaultKind(
             "camera", "the first image since then with new sensor noise, encoded again as JPEG"
         ),
-        "camera-stale": FaultKind("camera", "every answer is the image of delay_s ago", {"delay_s": (1.0, seconds)}),
-        "camera-slow": FaultKind("camera", "every answer comes delay_s late", {"delay_s": (1.0, seconds)}),
+        "camera-stale": FaultKind("camera", "every answer is the image of delay_s ago", {"delay_s": (1.0, _SECONDS)}),
+        "camera-slow": FaultKind("camera", "every answer comes delay_s late", {"delay_s": (1.0, _SECONDS)}),
         "camera-half-rate": FaultKind("camera", "images come at rate_hz at most", {"rate_hz": (5.0, (0.1, 60))}),
         "camera-black": FaultKind("camera", "the lens is covered: sensor noise only"),
         "camera-saturated": FaultKind("camera", "the camera is blinded by a lamp: white with noise"),
@@ -74,7 +74,7 @@ def _kinds() -> dict[str, FaultKind]:
         "odometry-nan": FaultKind(
             "state", "a field is NaN, or the quaternion is zero", {}, {"field": ("position", "velocity", "rpy")}
         ),
-        "odometry-lag": FaultKind("state", "the sport state comes delay_s late", {"delay_s": (0.3, seconds)}),
+        "odometry-lag": FaultKind("state", "the sport state comes delay_s late", {"delay_s": (0.3, _SECONDS)}),
         "odometry-bias": FaultKind("state", "the velocity reads dv_mps too high", {"dv_mps": (1.0, (-10, 10))}),
         "state-silent": FaultKind("state", "no state is sent on any topic"),
         "state-loss": FaultKind("state", "a share of the state messages is lost", {"percent": (50.0, (0, 100))}),
@@ -89,19 +89,17 @@ def _kinds() -> dict[str, FaultKind]:
         "remote-keys": FaultKind("remote", "keys are held down on the remote", {"keys": (float(L2_B), (0, 65535))}),
         "remote-stick": FaultKind("remote", "a stick is pushed on the remote", {"ly": (0.6, (-1, 1))}),
         "stop-unanswered": FaultKind(
-            "sport", "a StopMove is obeyed but answered delay_s later", {"delay_s": (10.0, seconds)}
+            "sport", "a StopMove is obeyed but answered delay_s later", {"delay_s": (10.0, _SECONDS)}
         ),
         "late-move": FaultKind(
             "sport",
             "one Move is held back until delay_s after the next StopMove",
-            {"delay_s": (0.2, seconds)},
+            {"delay_s": (0.2, _SECONDS)},
             once=True,
         ),
         "deaf": FaultKind("sport", "requests of the sport service are lost"),
     }
-
-
-KINDS: Final[Mapping[str, FaultKind]] = MappingProxyType(_kinds())
+)
 
 
 @dataclass(frozen=True)

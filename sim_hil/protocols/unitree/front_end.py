@@ -3,32 +3,25 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
-
-import numpy as np
-from numpy.typing import NDArray
 
 from edge.core.geometry import SE2
 from firmware_bridge.core.config import DdsConfig
 from firmware_bridge.unitree.dds import Bus, take_each
 from firmware_bridge.unitree.messages import ids
+from sim_hil.protocols.base import CameraFrontEnd
 from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, ReceivedCommand
-from sim_hil.protocols.unitree.camera_process import CameraProcess
-from sim_hil.protocols.unitree.drifting import DriftingOdometry
-from sim_hil.protocols.unitree.remote import Remote
+from sim_hil.protocols.render_process import RenderProcess
+from sim_hil.protocols.unitree.odometry import DriftingOdometry, OdometryFrame
 from sim_hil.protocols.unitree.services.avoidance import OBSTACLES_AVOID_VERSION, ObstaclesAvoid, Pilot, RangeFinder
 from sim_hil.protocols.unitree.services.behaviour import Go2Behaviour
 from sim_hil.protocols.unitree.services.idl_command import LowCmd_
-from sim_hil.protocols.unitree.services.leases import Lease
 from sim_hil.protocols.unitree.services.low_level import LOW_COMMAND_TOPIC
-from sim_hil.protocols.unitree.services.service import Answer, LeaseServer, Received, ServiceServer
-from sim_hil.protocols.unitree.services.sport import CommandLog, api_name
-from sim_hil.protocols.unitree.services.sport_service import UNLEASED, SportService
-from sim_hil.protocols.unitree.services.switching import MotionSwitcher, RobotState
-from sim_hil.protocols.unitree.services.vui import VUI_SERVICE, Vui
-from sim_hil.protocols.unitree.state import OdometryFrame, StatePublishers
+from sim_hil.protocols.unitree.services.service import Answer, Lease, LeaseServer, Received, ServiceServer
+from sim_hil.protocols.unitree.services.sport import UNLEASED, RequestLog, SportService, api_name
+from sim_hil.protocols.unitree.services.switching import VUI_SERVICE, MotionSwitcher, RobotState, Vui
+from sim_hil.protocols.unitree.state import Remote, StatePublishers
 from sim_hil.robots.go2.body import Go2, RobotTruth
 from sim_hil.robots.odometry_noise import LEVELS, OdometryNoise
 from sim_hil.simulation.physics import Simulation
@@ -40,7 +33,7 @@ if TYPE_CHECKING:
 PILOT_HZ: Final = 20  # rate of the obstacle check
 
 
-class UnitreeFrontEnd:
+class UnitreeFrontEnd(CameraFrontEnd):
     """Unitree front end of a simulated Go2. Raises DdsError, OSError or ValueError if it cannot be opened."""
 
     def __init__(self, simulation: Simulation, options: FrontEndOptions, dds: DdsConfig) -> None:
@@ -53,7 +46,6 @@ class UnitreeFrontEnd:
         self._closed = False
         self.bus = Bus(dds)
         """DDS participant; a process may have one per domain."""
-        self._camera: CameraProcess | None = None
         try:
             self._open(simulation, options)
         except BaseException:
@@ -62,7 +54,13 @@ class UnitreeFrontEnd:
 
     def _open(self, simulation: Simulation, options: FrontEndOptions) -> None:
         if options.camera_size is not None:
-            self._camera = _camera(simulation, options, options.camera_size, self._dds)
+            more = ["--domain", str(self._dds.domain), "--interface", self._dds.interface]
+            for peer in self._dds.peers:
+                more += ["--peer", peer]
+            if options.faults is not None:
+                more += ["--faults"]
+            length = len(simulation.render_state())
+            self._camera = RenderProcess("sim_hil.protocols.unitree.videohub", options, more, length)
         self._behaviour = Go2Behaviour(self._robot.sport, simulation.dt_s)
         self._robot.sport = self._behaviour  # type: ignore[assignment]  # the calls of a SportController that Go2 makes
         self._odometry = _odometry(options)
@@ -72,7 +70,10 @@ class UnitreeFrontEnd:
         self._open_services()
         remote = Remote()
         if options.faults is not None:
-            self._faults = self._injector(options.faults, remote)
+            # Imported here, so that without --faults no code that causes faults is loaded.
+            from sim_hil.protocols.unitree.fault_injector import FaultInjector
+
+            self._faults = FaultInjector(options.faults, remote=remote, camera=self._send_to_camera)
         self._publishers = StatePublishers(
             self.bus,
             self._odometry,
@@ -80,7 +81,7 @@ class UnitreeFrontEnd:
             remote=remote,
             faults=None if self._faults is None else self._faults.states,
         )
-        self._log = CommandLog()
+        self._log = RequestLog()
         self._low_level_active = False
         self._video_frames = 0
         self._video_malformed = 0
@@ -114,26 +115,13 @@ class UnitreeFrontEnd:
         x, y, _ = self._odometry.position((x_m, y_m, z_m))
         return SE2(x, y, self._odometry.rpy((0.0, 0.0, heading_rad))[2])
 
-    def _injector(self, path: Path, remote: Remote) -> FaultInjector:
-        # Imported here, so that without --faults no code that causes faults is loaded.
-        from sim_hil.protocols.unitree.fault_injector import FaultInjector
-
-        return FaultInjector(path, remote=remote, camera=self._tell_camera)
-
-    def _tell_camera(self, line: bytes) -> None:
+    def _send_to_camera(self, line: bytes) -> None:
         if self._camera is not None:
             self._camera.send(line)
 
     def where(self) -> str:
         """Return DDS domain and interface."""
         return f"domain {self._dds.domain} on {self._dds.interface}"
-
-    def start(self, render_state: NDArray[np.float64], stop: Sequence[int]) -> bool:
-        """Wait for the camera. Raises CameraProcessError."""
-        if self._camera is None:
-            return True
-        self._camera.show(render_state)
-        return self._camera.wait_ready(stop)
 
     def wait(self, left_ns: int) -> None:
         """Wait until a request arrives, at most `left_ns`."""
@@ -150,7 +138,17 @@ class UnitreeFrontEnd:
             received += self._handle_camera_event(event)
         for request in received:
             self._log.note(request)
-        return [_as_command(request) for request in received]
+        return [
+            ReceivedCommand(
+                one.received_ns,
+                one.service,
+                one.api_id,
+                api_name(one.service, one.api_id),
+                one.parameter,
+                one.request_id,
+            )
+            for one in received
+        ]
 
     def _serve_sport(self) -> list[Received]:
         if self._faults is None:
@@ -196,11 +194,6 @@ class UnitreeFrontEnd:
             assert isinstance(truth, RobotTruth)
             self._publishers.publish(due, truth, stamp_s, self._behaviour.progress)
 
-    def show(self, render_state: NDArray[np.float64]) -> None:
-        """Pass the state to render to the camera process."""
-        if self._camera is not None:
-            self._camera.show(render_state)
-
     def close(self) -> None:
         """End the camera process, remove the fault socket, close the DDS participant."""
         if self._faults is not None:
@@ -232,29 +225,8 @@ def open_front_end(simulation: Simulation, options: FrontEndOptions) -> UnitreeF
     return UnitreeFrontEnd(simulation, options, DdsConfig(options.domain, options.interface, peers))
 
 
-def _camera(
-    simulation: Simulation, options: FrontEndOptions, size: tuple[int, int], dds: DdsConfig
-) -> CameraProcess:  # fmt: skip
-    return CameraProcess(
-        options.scene_source,
-        people=options.people,
-        seed=options.seed,
-        size=size,
-        dds=dds,
-        state_length=len(simulation.render_state()),
-        faults=options.faults is not None,
-    )
-
-
 def _odometry(options: FrontEndOptions) -> OdometryFrame:
     start = options.scene.start
     if options.odometry_noise == "none":
         return OdometryFrame(start)
     return DriftingOdometry(start, OdometryNoise(LEVELS[options.odometry_noise], options.seed))
-
-
-def _as_command(request: Received) -> ReceivedCommand:
-    name = api_name(request.service, request.api_id)
-    return ReceivedCommand(
-        request.received_ns, request.service, request.api_id, name, request.parameter, request.request_id
-    )

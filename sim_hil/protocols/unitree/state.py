@@ -6,10 +6,9 @@ name that other robots and bindings use for odometry.
 
 from __future__ import annotations
 
-import math
 import struct
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
 from cyclonedds._clayer import ddspy_write
@@ -18,10 +17,10 @@ from cyclonedds.pub import DataWriter
 from firmware_bridge.unitree.dds import DDS_ERRORS, Bus
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.messages.binding import has_reader
-from firmware_bridge.unitree.messages.crc import LOW_STATE_LAYOUT, crc_of_words, low_state_crc, low_state_values
+from firmware_bridge.unitree.messages.crc import LOW_STATE_LAYOUT, crc_of_words, low_state_values
 from firmware_bridge.unitree.messages.idl import IMUState_, PathPoint_, SportModeState_, TimeSpec_, WirelessController_
 from firmware_bridge.unitree.messages.idl_low import BmsState_, LowState_, MotorState_
-from sim_hil.protocols.unitree.remote import Remote
+from sim_hil.protocols.unitree.odometry import OdometryFrame
 from sim_hil.robots.battery import CELLS, Battery, BatteryReading, load_w
 from sim_hil.robots.go2.body import RobotTruth
 
@@ -42,54 +41,32 @@ _CDR_LITTLE_ENDIAN: Final = b"\0\1\0\0"
 _LOW_STATE_CDR: Final = struct.Struct(
     "<4B4IH2x" + "13fB" + "B2x7fB3x3I" + "B3x7fB3x3I" * (_MOTORS - 1) + "4BiH4B15H" + "8hI41B3xf2B2x2f4HII"
 )
+_REMOTE_BYTES: Final = 40
 _FOOT_RAISE_M: Final = 0.09  # from the maker's sample
 
 
-class OdometryFrame:
-    """Frame in which a Go2 reports its pose: position and heading at switch-on."""
+@dataclass
+class Remote:
+    """State of the remote control: sticks in -1..1, keys as the bits of WirelessController_.keys."""
 
-    def __init__(self, start: tuple[float, float, float]) -> None:
-        """Create the frame; `start`: T_world_odom as (x_m, y_m, theta_rad)."""
-        self._x_m, self._y_m, self._theta_rad = start
-        self._cos, self._sin = math.cos(start[2]), math.sin(start[2])
+    lx: float = 0.0
+    ly: float = 0.0
+    rx: float = 0.0
+    ry: float = 0.0
+    keys: int = 0
 
-    def rotate(self, vector: Any) -> list[float]:
-        """Rotate a world vector [3] into the odometry frame."""
-        x, y, z = (float(v) for v in vector)
-        return [self._cos * x + self._sin * y, self._cos * y - self._sin * x, z]
+    def release(self) -> None:
+        """Release all sticks and keys."""
+        self.lx = self.ly = self.rx = self.ry = 0.0
+        self.keys = 0
 
-    def position(self, position_m: Any) -> list[float]:
-        """Transform a world position [3], m, into the odometry frame."""
-        x, y, z = (float(v) for v in position_m)
-        return self.rotate((x - self._x_m, y - self._y_m, z))
-
-    def rpy(self, rpy_rad: Any) -> list[float]:
-        """Transform roll, pitch and yaw [3], rad, into the odometry frame; yaw in (-pi, pi]."""
-        roll, pitch, yaw = (float(v) for v in rpy_rad)
-        turned = yaw - self._theta_rad
-        return [roll, pitch, math.atan2(math.sin(turned), math.cos(turned))]
-
-    def quaternion(self, wxyz: Any) -> list[float]:
-        """Transform an orientation (w, x, y, z) into the odometry frame."""
-        return turned_quaternion([float(v) for v in wxyz], -self._theta_rad)
-
-    def velocity(self, vector: object) -> list[float]:
-        """Return a world velocity [3] as the robot reports it, m/s, in the odometry frame."""
-        return self.rotate(vector)
-
-    def yaw_speed(self, wz_radps: float) -> float:
-        """Return a yaw rate as the robot reports it, rad/s."""
-        return wz_radps
-
-    def update(self, truth: RobotTruth) -> None:
-        """Advance to a new instant, before its messages are made; exact odometry does nothing."""
-
-
-def turned_quaternion(wxyz: list[float], yaw_rad: float) -> list[float]:
-    """Rotate an orientation (w, x, y, z) by a yaw angle about the frame's z axis."""
-    w, x, y, z = wxyz
-    c, s = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
-    return [c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w]
+    def as_bytes(self) -> bytes:
+        """Encode as LowState_.wireless_remote: keys at byte 2, then lx, rx, ry at 4, 8, 12 and ly at 20."""
+        data = bytearray(_REMOTE_BYTES)
+        struct.pack_into("<H", data, 2, self.keys)
+        struct.pack_into("<3f", data, 4, self.lx, self.rx, self.ry)
+        struct.pack_into("<f", data, 20, self.ly)
+        return bytes(data)
 
 
 def imu_state(truth: RobotTruth, odometry: OdometryFrame) -> IMUState_:
@@ -179,12 +156,6 @@ class LowStateMessage:
         battery.current = -round(1000 * reading.current_a)  # mA
         battery.cell_vol = [round(1000 * reading.voltage_v / CELLS)] * CELLS + [0] * 7  # mV
         message.power_v, message.power_a = reading.voltage_v, reading.current_a
-
-    def fill(self, truth: RobotTruth, odometry: OdometryFrame) -> LowState_:
-        """Fill and return the message for this instant, with checksum."""
-        message = self.update(truth, odometry)
-        message.crc = low_state_crc(message)
-        return message
 
     def encode(self) -> bytes:
         """Encode the message with a new checksum; same bytes as `serialize`, but much faster."""

@@ -1,6 +1,6 @@
 """The front camera as a process of its own: answers `videohub` GetImageSample with a JPEG rendered at that moment.
 
-Started by `CameraProcess`; talks to its parent through three pipes' worth of plain things: the pose in shared memory
+Started by the front end; it communicates with its parent through three descriptors: the pose in shared memory
 (`snapshot.py`), events as JSON lines on what was stdout at the start, and an end of file on stdin when the parent has
 gone.
 """
@@ -18,9 +18,10 @@ from firmware_bridge.core.config import DdsConfig
 from firmware_bridge.unitree.dds import Bus
 from firmware_bridge.unitree.messages import ids
 from sim_hil.processes.child_process import input_is_open, take_standard_output, write_message
+from sim_hil.protocols.render_process import encode_jpeg
 from sim_hil.protocols.snapshot import SnapshotReader
 from sim_hil.protocols.unitree.services.service import ServiceServer
-from sim_hil.protocols.unitree.video_service import VideoHub, encode_jpeg
+from sim_hil.protocols.unitree.video_service import VideoHub
 from sim_hil.scene.scene import load_scene
 from sim_hil.simulation.camera import CameraWorld
 from sim_hil.simulation.sensor_noise import SensorNoise
@@ -46,7 +47,7 @@ def main(argv: list[str] | None = None) -> int:
     # A Ctrl-C reaches the whole process group; the parent decides when the camera ends.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
-    tell = functools.partial(write_message, take_standard_output())
+    report = functools.partial(write_message, take_standard_output())
 
     world = CameraWorld(load_scene(args.scene), people=args.people, seed=args.seed)
     poses = SnapshotReader(args.pose_fd, world.state_size)
@@ -60,16 +61,16 @@ def main(argv: list[str] | None = None) -> int:
     bus = Bus(DdsConfig(args.domain, args.interface, tuple(args.peer)))
     server = ServiceServer(bus, ids.VIDEO_SERVICE)
     waitset = bus.waitset(server.reader)
-    hub, alive, check_ns = VideoHub(server, render, tell), input_is_open, _PARENT_CHECK_NS
+    hub, alive, check_ns = VideoHub(server, render, report), input_is_open, _PARENT_CHECK_NS
     if args.faults:
         from sim_hil.protocols.unitree.camera_faults import FaultyVideoHub  # not loaded where no fault may be injected
 
         size, check_ns = (args.width, args.height), _FAULTS_CHECK_NS
-        hub = faulty = FaultyVideoHub(server, render, tell, size=size, commands_fd=sys.stdin.fileno())
+        hub = faulty = FaultyVideoHub(server, render, report, size=size, commands_fd=sys.stdin.fileno())
         alive = faulty.listen
     # BrokenPipeError: the parent died between two looks at stdin.
     with contextlib.closing(world), contextlib.closing(poses), contextlib.suppress(BrokenPipeError):
-        tell({"event": "ready"})
+        report({"event": "ready"})
         while alive():
             waitset.wait(check_ns)
             hub.serve()

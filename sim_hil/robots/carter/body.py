@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from sim_hil.robots.battery import BatteryReading
 from sim_hil.robots.carter.battery import CarterBattery, load_w
-from sim_hil.robots.carter.drive import DriveController, DriveLimits
-from sim_hil.robots.carter.urdf import BODY_COM_M, LENGTH_M, LINKS, RADIUS_M, write_carter_urdf
-from sim_hil.robots.carter.wheel_odometry import OdometrySample, WheelCalibration, WheelOdometry
+from sim_hil.robots.carter.drive import DriveController, OdometrySample, WheelCalibration, WheelOdometry
+from sim_hil.robots.carter.urdf import BODY_COM_M, LINKS, RADIUS_M, write_carter_urdf
 from sim_hil.robots.go2.gait import GRAVITY_MPS2
 from sim_hil.robots.interface import BaseTruth
 
@@ -40,15 +39,12 @@ _MIN_BUMP_N: Final = 5.0
 
 @dataclass(frozen=True)
 class Bumpers:
-    """Which sides of the shell have been pushed within the last 0.2 s."""
+    """Sides of the shell that were pushed within the last 0.2 s."""
 
     front: bool = False
     rear: bool = False
     left: bool = False
     right: bool = False
-
-    def __bool__(self) -> bool:
-        return self.front or self.rear or self.left or self.right
 
 
 @dataclass(frozen=True)
@@ -87,61 +83,33 @@ def _unrotate(quaternion_xyzw: Quaternion, v: Vec3) -> Vec3:
     return _rotate((-x, -y, -z, w), v)
 
 
-def load_carter(
-    client: int, folder: Path, position: tuple[float, float, float], yaw_rad: float
-) -> tuple[int, list[int]]:
-    """Load the URDF into `client`; return the body id and the joint indices of the left and the right wheel."""
-    body = pybullet.loadURDF(
-        str(write_carter_urdf(folder)),
-        position,
-        pybullet.getQuaternionFromEuler((0, 0, yaw_rad)),
-        # Round wheels: without the flag a cylinder becomes a prism, and its edges hammer the tyres off the floor.
-        flags=pybullet.URDF_USE_INERTIA_FROM_FILE | pybullet.URDF_USE_IMPLICIT_CYLINDER,
-        physicsClientId=client,
-    )
-    index = {}
-    for joint in range(pybullet.getNumJoints(body, physicsClientId=client)):
-        index[pybullet.getJointInfo(body, joint, physicsClientId=client)[12].decode()] = joint
-    return body, [index[LINKS[0]], index[LINKS[1]]]
-
-
-def place_carter(client: int, body: int, joints: list[int], state: Array) -> None:
-    """Set a loaded Carter to the pose of a render state."""
-    x, y, z, qx, qy, qz, qw = (float(value) for value in state[:7])
-    ax, ay, az = _rotate((qx, qy, qz, qw), BODY_COM_M)
-    pybullet.resetBasePositionAndOrientation(body, (x + ax, y + ay, z + az), (qx, qy, qz, qw), physicsClientId=client)
-    for joint, angle in zip(joints, state[7:9], strict=True):
-        pybullet.resetJointState(body, joint, float(angle), physicsClientId=client)
-
-
 class Carter:
     """The robot's body in one physics client (a `sim_hil.robots.interface.Robot`)."""
 
     radius_m = RADIUS_M
-    half_length_m = LENGTH_M / 2
-    render_fields = RENDER_FIELDS
 
     def __init__(
-        self,
-        client: int,
-        folder: Path,
-        start: tuple[float, float, float],
-        dt_s: float,
-        *,
-        ground_m: float = 0.0,
-        limits: DriveLimits | None = None,
-        calibration: WheelCalibration | None = None,
-        soc: float = 1.0,
+        self, client: int, folder: Path, start: Vec3, dt_s: float, *, calibration: WheelCalibration | None = None
     ) -> None:
-        """Load the robot. `start`: x m, y m, heading rad; `ground_m`: height of the ground there; `calibration`:
-        wheel dimensions assumed by odometry; `soc`: the battery's charge, 0 to 1.
-        """
+        """Load the robot. `start`: x m, y m, heading rad; `calibration`: wheel dimensions assumed by odometry."""
         self._client = client
         self._dt_s = dt_s
-        self.body, self._wheels = load_carter(client, folder, (start[0], start[1], ground_m), start[2])
-        self.controller = DriveController(dt_s, limits)
+        self.body = pybullet.loadURDF(
+            str(write_carter_urdf(folder)),
+            (start[0], start[1], 0.0),
+            pybullet.getQuaternionFromEuler((0, 0, start[2])),
+            # Round wheels: without the flag a cylinder becomes a prism, and its edges hammer the tyres off the floor.
+            flags=pybullet.URDF_USE_INERTIA_FROM_FILE | pybullet.URDF_USE_IMPLICIT_CYLINDER,
+            physicsClientId=client,
+        )
+        links = {
+            pybullet.getJointInfo(self.body, link, physicsClientId=client)[12].decode(): link
+            for link in range(pybullet.getNumJoints(self.body, physicsClientId=client))
+        }
+        self._wheels = [links[LINKS[0]], links[LINKS[1]]]
+        self.controller = DriveController(dt_s)
         self._odometry = WheelOdometry(calibration)
-        self._battery = CarterBattery(soc)
+        self._battery = CarterBattery()
         pybullet.setJointMotorControlArray(
             self.body, self._wheels, pybullet.VELOCITY_CONTROL, forces=[WHEEL_FRICTION_NM] * 2, physicsClientId=client
         )
@@ -179,7 +147,7 @@ class Carter:
 
     @property
     def ready(self) -> bool:
-        """Whether the base would obey a velocity command now."""
+        """Whether the base would follow a velocity command now."""
         return self.controller.ready
 
     def drive(self) -> None:
@@ -221,7 +189,7 @@ class Carter:
         self._bumped_steps[side] = self._steps
 
     def bumpers(self) -> Bumpers:
-        """Which sides of the shell have been pushed within the last 0.2 s."""
+        """Return the sides of the shell that were pushed within the last 0.2 s."""
         since = self._steps - round(_BUMPER_HOLD_S / self._dt_s)
         return Bumpers(**{side: step > since for side, step in self._bumped_steps.items()})
 

@@ -1,15 +1,19 @@
-"""Drive electronics of the Carter: a velocity command in, two wheel torques out. Pure: no clock, no physics.
+"""Drive of the Carter: a velocity command in, two wheel torques and wheel odometry out. Pure: no clock, no physics.
 
 A reference velocity follows the command within acceleration limits. A feed-forward torque and a PI controller per wheel
 track it. The motors' torque limit decreases near their top speed. A command is valid for 1 s; then the base brakes.
+Odometry integrates the encoders with a calibration of the wheels, so it includes their slip and its errors.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isfinite
+from math import cos, floor, isfinite, pi, sin
 from typing import Final
 
+import numpy as np
+
+from edge.core.geometry import SE2
 from sim_hil.robots.carter.urdf import MASS_KG, TRACK_M, WHEEL_INERTIA_KGM2, WHEEL_RADIUS_M
 
 HOLD_S: Final = 1.0  # the robots' contract (sim_hil/robots/interface.py)
@@ -21,23 +25,19 @@ NO_LOAD_RADPS: Final = 3.3 / WHEEL_RADIUS_M
 _KP_NMS_PER_RAD: Final = 8.0
 _KI_NM_PER_RAD: Final = 30.0
 _TURN_INERTIA_KGM2: Final = 3.0
-
-
-@dataclass(frozen=True)
-class DriveLimits:
-    """Limits of commands and of the reference's acceleration; braking has its own limit."""
-
-    v_max_mps: float = 1.5
-    w_max_radps: float = 2.0
-    accel_mps2: float = 1.0
-    brake_mps2: float = 2.0
-    estop_mps2: float = 2.5
-    alpha_radps2: float = 4.0
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not (isfinite(value) and value > 0):
-                raise ValueError(f"drive limits: {name}: expected a number above 0, found {value}")
+# Limits of commands, and of the reference's acceleration and braking.
+V_MAX_MPS: Final = 1.5
+W_MAX_RADPS: Final = 2.0
+ACCEL_MPS2: Final = 1.0
+BRAKE_MPS2: Final = 2.0
+ESTOP_MPS2: Final = 2.5
+ALPHA_RADPS2: Final = 4.0
+COUNTS_PER_TURN: Final = 4096  # our choice: an encoder of 12 bits on the wheel
+# Our choice, of the size that tyres differ by: 0.2 % between two of a kind, 0.5 % for both, 1 % of the track where the
+# tyre's width hides the point that it turns about. 0.2 % between the wheels turns the report by 0.28 degrees a metre.
+_SCALE_SIGMA: Final = 0.005
+_MISMATCH_SIGMA: Final = 0.002
+_TRACK_SIGMA: Final = 0.01
 
 
 def _towards(now: float, target: float, up: float, down: float) -> float:
@@ -50,11 +50,9 @@ def _towards(now: float, target: float, up: float, down: float) -> float:
 
 
 class DriveController:
-    """Controller of both wheels; call `step` once per physics step."""
+    """Controller of both wheels; call `step` once per physics step, every `dt_s`."""
 
-    def __init__(self, dt_s: float, limits: DriveLimits | None = None) -> None:
-        """`dt_s`: time between two calls of `step`."""
-        self.limits = limits or DriveLimits()
+    def __init__(self, dt_s: float) -> None:
         self.powered = False
         self.estop = False
         self._dt_s = dt_s
@@ -71,8 +69,7 @@ class DriveController:
             raise ValueError(f"drive: expected finite velocities, found {v_mps}, {w_radps}")
         if not self.ready:
             return
-        v, w = self.limits.v_max_mps, self.limits.w_max_radps
-        self._target = (max(-v, min(v, v_mps)), max(-w, min(w, w_radps)))
+        self._target = (max(-V_MAX_MPS, min(V_MAX_MPS, v_mps)), max(-W_MAX_RADPS, min(W_MAX_RADPS, w_radps)))
         self._left_steps = self._hold
 
     @property
@@ -95,10 +92,10 @@ class DriveController:
         v_target, w_target = self.commanded
         if self._left_steps > 0:
             self._left_steps -= 1
-        dt, limits = self._dt_s, self.limits
-        brake = limits.estop_mps2 if self.estop else limits.brake_mps2
-        v = _towards(self._v, v_target, limits.accel_mps2 * dt, brake * dt)
-        w = _towards(self._w, w_target, limits.alpha_radps2 * dt, limits.alpha_radps2 * dt)
+        dt = self._dt_s
+        brake = ESTOP_MPS2 if self.estop else BRAKE_MPS2
+        v = _towards(self._v, v_target, ACCEL_MPS2 * dt, brake * dt)
+        w = _towards(self._w, w_target, ALPHA_RADPS2 * dt, ALPHA_RADPS2 * dt)
         a, alpha = (v - self._v) / dt, (w - self._w) / dt
         if v == 0.0 == w and (self._v != 0.0 or self._w != 0.0):
             # Come to rest: a wheel that was pushing something must let go of it. The integral starts anew and holds the
@@ -129,3 +126,71 @@ def _within(torque_nm: float, speed_radps: float) -> float:
     up = driving if speed_radps > 0 else MAX_TORQUE_NM
     down = driving if speed_radps < 0 else MAX_TORQUE_NM
     return max(-down, min(up, torque_nm))
+
+
+@dataclass(frozen=True)
+class WheelCalibration:
+    """Assumed dimensions of the wheels, m."""
+
+    left_radius_m: float = WHEEL_RADIUS_M
+    right_radius_m: float = WHEEL_RADIUS_M
+    track_m: float = TRACK_M
+
+    @staticmethod
+    def drawn(seed: int) -> WheelCalibration:
+        """Return a calibration with typical errors; deterministic per seed."""
+        rng = np.random.default_rng((seed, 0x0D0))
+        scale, mismatch, track = (float(value) for value in rng.standard_normal(3))
+        radius = WHEEL_RADIUS_M * (1 + _SCALE_SIGMA * scale)
+        half = _MISMATCH_SIGMA * mismatch / 2
+        return WheelCalibration(radius * (1 - half), radius * (1 + half), TRACK_M * (1 + _TRACK_SIGMA * track))
+
+
+@dataclass(frozen=True)
+class OdometrySample:
+    """Odometry report: `T_odom_base`, body velocity from the wheel speeds, distance travelled, encoder counts."""
+
+    T_odom_base: SE2
+    v_mps: float
+    w_radps: float
+    distance_m: float
+    left_counts: int
+    right_counts: int
+
+
+def _counts(angle_rad: float) -> int:
+    return floor(angle_rad * COUNTS_PER_TURN / (2 * pi))
+
+
+class WheelOdometry:
+    """Integrator of encoder counts, starting at the origin; call `step` after every physics step."""
+
+    def __init__(self, calibration: WheelCalibration | None = None) -> None:
+        calibration = calibration or WheelCalibration()
+        self._calibration = calibration
+        self._left_m = 2 * pi * calibration.left_radius_m / COUNTS_PER_TURN
+        self._right_m = 2 * pi * calibration.right_radius_m / COUNTS_PER_TURN
+        self._left = self._right = 0
+        self._x = self._y = self._theta = self._way = 0.0
+
+    def step(self, left_rad: float, right_rad: float) -> None:
+        """Add the wheels' angles."""
+        left, right = _counts(left_rad), _counts(right_rad)
+        left_m, right_m = (left - self._left) * self._left_m, (right - self._right) * self._right_m
+        self._left, self._right = left, right
+        moved, turned = (left_m + right_m) / 2, (right_m - left_m) / self._calibration.track_m
+        # The chord of the arc, along its middle heading: exact for a turn at a steady rate to the third order.
+        middle = self._theta + turned / 2
+        self._x += moved * cos(middle)
+        self._y += moved * sin(middle)
+        self._theta += turned
+        self._way += abs(moved)
+
+    def sample(self, left_radps: float, right_radps: float) -> OdometrySample:
+        """Return the report; speeds come from the motors, because the counts of one step are too coarse."""
+        wheels = self._calibration
+        left, right = left_radps * wheels.left_radius_m, right_radps * wheels.right_radius_m
+        pose = SE2(self._x, self._y, self._theta)
+        return OdometrySample(
+            pose, (left + right) / 2, (right - left) / wheels.track_m, self._way, self._left, self._right
+        )

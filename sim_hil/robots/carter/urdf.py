@@ -16,6 +16,8 @@ from math import hypot, pi
 from pathlib import Path
 from typing import Final
 
+from sim_hil.robots.urdf import box, cylinder, inertial, shape, write_urdf, xyz
+
 LENGTH_M: Final = 0.725
 WIDTH_M: Final = 0.500
 HEIGHT_M: Final = 0.556
@@ -51,61 +53,34 @@ _LENS = "0.04 0.05 0.09 1"
 _QUARTER = pi / 2  # lays a cylinder along y
 
 
-def _xyz(*values: float) -> str:
-    return " ".join(f"{value:.9g}" for value in values)
-
-
 def _box_inertia(mass_kg: float, x_m: float, y_m: float, z_m: float) -> tuple[float, float, float]:
     share = mass_kg / 12
     return (share * (y_m**2 + z_m**2), share * (x_m**2 + z_m**2), share * (x_m**2 + y_m**2))
-
-
-def _inertial(mass_kg: float, com_m: tuple[float, float, float], diagonal: tuple[float, float, float]) -> str:
-    ixx, iyy, izz = diagonal
-    return (
-        f'<inertial><origin xyz="{_xyz(*com_m)}"/><mass value="{mass_kg:g}"/>'
-        f'<inertia ixx="{ixx:.6g}" ixy="0" ixz="0" iyy="{iyy:.6g}" iyz="0" izz="{izz:.6g}"/></inertial>'
-    )
-
-
-def _shape(
-    tag: str, geometry: str, xyz_m: tuple[float, float, float], rpy: tuple[float, ...] = (0, 0, 0), rgba: str = ""
-) -> str:
-    material = f'<material name="c{rgba.replace(" ", "_")}"><color rgba="{rgba}"/></material>' if rgba else ""
-    return f'<{tag}><origin xyz="{_xyz(*xyz_m)}" rpy="{_xyz(*rpy)}"/><geometry>{geometry}</geometry>{material}</{tag}>'
-
-
-def _box(x: float, y: float, z: float) -> str:
-    return f'<box size="{_xyz(x, y, z)}"/>'
-
-
-def _cylinder(radius: float, length: float) -> str:
-    return f'<cylinder radius="{radius:g}" length="{length:g}"/>'
 
 
 def _base() -> str:
     tall, middle = DECK_M - CLEARANCE_M, (DECK_M + CLEARANCE_M) / 2
     mast = HEIGHT_M - 0.06 - DECK_M
     parts = [
-        _inertial(BODY_MASS_KG, BODY_COM_M, _box_inertia(BODY_MASS_KG, 0.66, 0.44, 0.30)),
+        inertial(BODY_MASS_KG, BODY_COM_M, _box_inertia(BODY_MASS_KG, 0.66, 0.44, 0.30)),
         # Low shell with cut corners, a deck on it, and the mast that carries camera and lidar.
-        _shape("visual", _box(LENGTH_M - 0.01, _NOSE_WIDTH_M, tall - 0.03), (0, 0, middle - 0.015), rgba=_SHELL),
-        _shape("visual", _box(_MIDDLE_LENGTH_M, 0.36, tall - 0.03), (0, 0, middle - 0.015), rgba=_SHELL),
-        _shape("visual", _box(0.13, WIDTH_M - 0.02, tall - 0.03), (-0.235, 0, middle - 0.015), rgba=_SHELL),
-        _shape("visual", _box(0.13, WIDTH_M - 0.02, tall - 0.03), (0.235, 0, middle - 0.015), rgba=_SHELL),
-        _shape("visual", _box(_MIDDLE_LENGTH_M, WIDTH_M - 0.02, 0.03), (0, 0, DECK_M - 0.015), rgba=_DECK),
-        _shape("visual", _box(0.015, _NOSE_WIDTH_M - 0.04, 0.025), (LENGTH_M / 2 - 0.004, 0, 0.22), rgba=_GREEN),
-        _shape("visual", _box(0.02, _NOSE_WIDTH_M + 0.01, 0.05), (LENGTH_M / 2 - 0.009, 0, 0.115), rgba=_BLACK),
-        _shape("visual", _box(0.02, _NOSE_WIDTH_M + 0.01, 0.05), (-LENGTH_M / 2 + 0.009, 0, 0.115), rgba=_BLACK),
-        _shape("visual", _box(0.10, 0.16, mast), (0.19, 0, DECK_M + mast / 2), rgba=_SHELL),
-        _shape("visual", _box(0.012, 0.15, 0.045), (0.243, 0, 0.45), rgba=_DECK),
-        _shape("visual", _cylinder(0.012, 0.012), (0.249, 0.05, 0.45), (0, _QUARTER, 0), _LENS),
-        _shape("visual", _cylinder(0.012, 0.012), (0.249, -0.05, 0.45), (0, _QUARTER, 0), _LENS),
-        _shape("visual", _cylinder(0.05, 0.06), (0.19, 0, HEIGHT_M - 0.03), rgba=_BLACK),
-        _shape("visual", _box(0.03, 0.05, 0.02), (-0.25, 0, DECK_M + 0.01), rgba="0.80 0.10 0.08 1"),
-        _shape("collision", _box(LENGTH_M, _NOSE_WIDTH_M, tall), (0, 0, middle)),
-        _shape("collision", _box(_MIDDLE_LENGTH_M, WIDTH_M, tall), (0, 0, middle)),
-        _shape("collision", _box(0.10, 0.16, HEIGHT_M - DECK_M), (0.19, 0, (HEIGHT_M + DECK_M) / 2)),
+        shape("visual", box(LENGTH_M - 0.01, _NOSE_WIDTH_M, tall - 0.03), (0, 0, middle - 0.015), rgba=_SHELL),
+        shape("visual", box(_MIDDLE_LENGTH_M, 0.36, tall - 0.03), (0, 0, middle - 0.015), rgba=_SHELL),
+        shape("visual", box(0.13, WIDTH_M - 0.02, tall - 0.03), (-0.235, 0, middle - 0.015), rgba=_SHELL),
+        shape("visual", box(0.13, WIDTH_M - 0.02, tall - 0.03), (0.235, 0, middle - 0.015), rgba=_SHELL),
+        shape("visual", box(_MIDDLE_LENGTH_M, WIDTH_M - 0.02, 0.03), (0, 0, DECK_M - 0.015), rgba=_DECK),
+        shape("visual", box(0.015, _NOSE_WIDTH_M - 0.04, 0.025), (LENGTH_M / 2 - 0.004, 0, 0.22), rgba=_GREEN),
+        shape("visual", box(0.02, _NOSE_WIDTH_M + 0.01, 0.05), (LENGTH_M / 2 - 0.009, 0, 0.115), rgba=_BLACK),
+        shape("visual", box(0.02, _NOSE_WIDTH_M + 0.01, 0.05), (-LENGTH_M / 2 + 0.009, 0, 0.115), rgba=_BLACK),
+        shape("visual", box(0.10, 0.16, mast), (0.19, 0, DECK_M + mast / 2), rgba=_SHELL),
+        shape("visual", box(0.012, 0.15, 0.045), (0.243, 0, 0.45), rgba=_DECK),
+        shape("visual", cylinder(0.012, 0.012), (0.249, 0.05, 0.45), (0, _QUARTER, 0), _LENS),
+        shape("visual", cylinder(0.012, 0.012), (0.249, -0.05, 0.45), (0, _QUARTER, 0), _LENS),
+        shape("visual", cylinder(0.05, 0.06), (0.19, 0, HEIGHT_M - 0.03), rgba=_BLACK),
+        shape("visual", box(0.03, 0.05, 0.02), (-0.25, 0, DECK_M + 0.01), rgba="0.80 0.10 0.08 1"),
+        shape("collision", box(LENGTH_M, _NOSE_WIDTH_M, tall), (0, 0, middle)),
+        shape("collision", box(_MIDDLE_LENGTH_M, WIDTH_M, tall), (0, 0, middle)),
+        shape("collision", box(0.10, 0.16, HEIGHT_M - DECK_M), (0.19, 0, (HEIGHT_M + DECK_M) / 2)),
     ]
     return f'<link name="base">{"".join(parts)}</link>'
 
@@ -116,46 +91,37 @@ def _wheel(name: str, left: int) -> str:
     across = WHEEL_MASS_KG * (3 * WHEEL_RADIUS_M**2 + TYRE_WIDTH_M**2) / 12
     turned = (_QUARTER, 0.0, 0.0)
     link = (
-        _inertial(WHEEL_MASS_KG, (0, 0, 0), (across, roll, across))
-        + _shape("visual", _cylinder(WHEEL_RADIUS_M, TYRE_WIDTH_M), (0, 0, 0), turned, _TYRE)
-        + _shape("visual", _cylinder(0.085, TYRE_WIDTH_M + 0.008), (0, 0, 0), turned, _HUB)
+        inertial(WHEEL_MASS_KG, (0, 0, 0), (across, roll, across))
+        + shape("visual", cylinder(WHEEL_RADIUS_M, TYRE_WIDTH_M), (0, 0, 0), turned, _TYRE)
+        + shape("visual", cylinder(0.085, TYRE_WIDTH_M + 0.008), (0, 0, 0), turned, _HUB)
         # A mark on the hub shows from outside whether the wheel turns.
-        + _shape("visual", _box(0.02, TYRE_WIDTH_M + 0.012, 0.15), (0, 0, 0), rgba=_SHELL)
-        + _shape("collision", _cylinder(WHEEL_RADIUS_M, _CONTACT_WIDTH_M), (0, 0, 0), turned)
+        + shape("visual", box(0.02, TYRE_WIDTH_M + 0.012, 0.15), (0, 0, 0), rgba=_SHELL)
+        + shape("collision", cylinder(WHEEL_RADIUS_M, _CONTACT_WIDTH_M), (0, 0, 0), turned)
     )
     return (
         f'<link name="{name}">{link}</link>'
         f'<joint name="{name}" type="continuous"><parent link="base"/><child link="{name}"/>'
-        f'<origin xyz="{_xyz(0, y, WHEEL_RADIUS_M)}"/><axis xyz="0 1 0"/></joint>'
+        f'<origin xyz="{xyz(0, y, WHEEL_RADIUS_M)}"/><axis xyz="0 1 0"/></joint>'
     )
 
 
 def _casters() -> str:
     ball = f'<sphere radius="{CASTER_RADIUS_M:g}"/>'
-    parts = [_inertial(CASTERS_MASS_KG, (0, 0, CASTER_RADIUS_M), (0.06, 0.003, 0.06))]
+    parts = [inertial(CASTERS_MASS_KG, (0, 0, CASTER_RADIUS_M), (0.06, 0.003, 0.06))]
     for side in (-1, 1):
         at = (0.0, side * CASTER_Y_M, CASTER_RADIUS_M)
         parts += [
-            _shape("visual", _cylinder(CASTER_RADIUS_M, 0.035), at, (_QUARTER, 0, 0), _TYRE),
-            _shape("visual", _box(0.03, 0.05, 0.08), (0.0, at[1], CASTER_RADIUS_M + 0.03), rgba=_HUB),
-            _shape("collision", ball, at),
+            shape("visual", cylinder(CASTER_RADIUS_M, 0.035), at, (_QUARTER, 0, 0), _TYRE),
+            shape("visual", box(0.03, 0.05, 0.08), (0.0, at[1], CASTER_RADIUS_M + 0.03), rgba=_HUB),
+            shape("collision", ball, at),
         ]
     return (
         f'<link name="casters">{"".join(parts)}</link>'
         '<joint name="casters" type="fixed"><parent link="base"/><child link="casters"/>'
-        f'<origin xyz="{_xyz(CASTER_X_M, 0, 0)}"/></joint>'
+        f'<origin xyz="{xyz(CASTER_X_M, 0, 0)}"/></joint>'
     )
 
 
-def carter_urdf() -> str:
-    """Return the Carter as URDF text: base, two driven wheels, one link with both casters; SI units."""
-    parts = _base() + _wheel("left_wheel", 1) + _wheel("right_wheel", -1) + _casters()
-    # PyBullet reads lines of at most 8 KiB and breaks longer ones wherever that falls, inside a word too.
-    return f'<?xml version="1.0"?><robot name="carter">{parts}</robot>'.replace("><", ">\n<") + "\n"
-
-
 def write_carter_urdf(folder: Path) -> Path:
-    """Write the URDF into `folder` (PyBullet only loads files) and return its path."""
-    path = folder / "carter.urdf"
-    path.write_text(carter_urdf(), encoding="utf-8")
-    return path
+    """Write the Carter's URDF, the base, two driven wheels and one link with both casters; return its path."""
+    return write_urdf("carter", _base() + _wheel("left_wheel", 1) + _wheel("right_wheel", -1) + _casters(), folder)

@@ -60,24 +60,6 @@ def rotation_matrix(quaternion_xyzw: tuple[float, ...]) -> Array:
     )
 
 
-def load_go2(client: int, folder: Path, position: tuple[float, float, float], yaw_rad: float) -> tuple[int, list[int]]:
-    """Load the URDF into `client`; return the body id and the 12 joint indices in JOINT_NAMES' order."""
-    path = write_go2_urdf(folder)
-    body = pybullet.loadURDF(
-        str(path),
-        position,
-        pybullet.getQuaternionFromEuler((0, 0, yaw_rad)),
-        flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
-        physicsClientId=client,
-    )
-    index = {}
-    for joint in range(pybullet.getNumJoints(body, physicsClientId=client)):
-        index[pybullet.getJointInfo(body, joint, physicsClientId=client)[1].decode()] = joint
-    for name, angle in zip(JOINT_NAMES, LYING_RAD, strict=True):
-        pybullet.resetJointState(body, index[name], angle, physicsClientId=client)
-    return body, [index[name] for name in JOINT_NAMES]
-
-
 class Go2:
     """The robot's body in one physics client; implements sim_hil.robots.interface.Robot.
 
@@ -86,20 +68,27 @@ class Go2:
     """
 
     radius_m = RADIUS_M
-    half_length_m = HALF_LENGTH_M
-    render_fields = RENDER_FIELDS
     _forward: Vec3  # the base's x and z axes in the world
     _upward: Vec3
 
     def __init__(self, client: int, folder: Path, start: tuple[float, float, float], dt_s: float) -> None:
         self._client = client
         self._dt_s = dt_s
-        self.body, self._joints = load_go2(client, folder, (start[0], start[1], LYING_HEIGHT_M), start[2])
-        self.sport = SportController(dt_s)
+        self.body = pybullet.loadURDF(
+            str(write_go2_urdf(folder)),
+            (start[0], start[1], LYING_HEIGHT_M),
+            pybullet.getQuaternionFromEuler((0, 0, start[2])),
+            flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
+            physicsClientId=client,
+        )
         links = pybullet.getNumJoints(self.body, physicsClientId=client)
         names = {
             pybullet.getJointInfo(self.body, link, physicsClientId=client)[1].decode(): link for link in range(links)
         }
+        self._joints = [names[name] for name in JOINT_NAMES]
+        for joint, angle in zip(self._joints, LYING_RAD, strict=True):
+            pybullet.resetJointState(self.body, joint, angle, physicsClientId=client)
+        self.sport = SportController(dt_s)
         self._feet = [names[f"{leg}_foot"] for leg in LEGS]
         self._set_friction(JOINT_FRICTION_NM)
         self._trotting = False
@@ -108,7 +97,7 @@ class Go2:
         for link in range(-1, links):
             grip = FOOT_GRIP if link in self._feet else SHELL_GRIP
             pybullet.changeDynamics(self.body, link, lateralFriction=grip, physicsClientId=client)
-        self._torques: tuple[float, ...] = (0.0,) * 12
+        self.torques_nm: tuple[float, ...] = (0.0,) * 12  # of the latest step
         self._accel: Vec3 = (0.0, 0.0, GRAVITY_MPS2)
         self._accel_blend = 1.0 - exp(-2.0 * pi * ACCEL_CUTOFF_HZ * dt_s)
         self._read()
@@ -176,15 +165,10 @@ class Go2:
         self._measured = Measured(self._q, self._dq, body, up)
         return self._measured
 
-    @property
-    def torques_nm(self) -> tuple[float, ...]:
-        """The 12 joint torques of the latest step."""
-        return self._torques
-
     def drive(self) -> None:
         """Apply the sport controller's torques for this step."""
         sport = self.sport
-        self._torques = forces = sport.step(self.measured())
+        self.torques_nm = forces = sport.step(self.measured())
         if sport.trotting != self._trotting:
             self._trotting = sport.trotting
             self._set_friction(0.0 if self._trotting else JOINT_FRICTION_NM)
@@ -278,7 +262,7 @@ class Go2:
             accel_mps2=np.array(self._accel),
             joint_q_rad=np.array(self._q),
             joint_dq_radps=np.array(self._dq),
-            joint_tau_nm=np.array(self._torques),
+            joint_tau_nm=np.array(self.torques_nm),
             foot_force_n=np.array(forces),
             foot_position_body_m=np.array([foot_position(leg, q) for leg, q, _ in legs]),
             foot_velocity_body_mps=np.array([foot_velocity(leg, q, dq) for leg, q, dq in legs]),
@@ -287,13 +271,3 @@ class Go2:
             body_height_m=self._position[2],
             commanded=self.sport.commanded,
         )
-
-
-def place_go2(client: int, body: int, joints: list[int], state: Array) -> None:
-    """Set a loaded Go2 to the pose of a render state (base frame, not centre of mass; then the joints)."""
-    position, quaternion = tuple(float(v) for v in state[:3]), tuple(float(v) for v in state[3:7])
-    arm = rotation_matrix(quaternion) @ BASE_COM_M
-    centre = [position[axis] + float(arm[axis]) for axis in range(3)]
-    pybullet.resetBasePositionAndOrientation(body, centre, quaternion, physicsClientId=client)
-    for joint, angle in zip(joints, state[7:19], strict=True):
-        pybullet.resetJointState(body, joint, float(angle), physicsClientId=client)

@@ -56,18 +56,6 @@ class GaitConfig:
     run_mps: float = 1.0
     turn_mps2: float = 1.5
 
-    def __post_init__(self) -> None:
-        for period_s, ratio in (
-            (self.period_s, self.stance_ratio),
-            (self.fast_period_s, self.fast_stance_ratio),
-        ):
-            if not 0.2 <= period_s <= 1.0 or not 0.5 <= ratio < 0.9:
-                raise ValueError(f"gait: period {period_s} s or stance ratio {ratio} makes no trot")
-        if not 0.0 <= self.slow_mps < self.fast_mps:
-            raise ValueError(f"gait: speeds {self.slow_mps} and {self.fast_mps} m/s, expected 0 <= slow < fast")
-        if not 0.15 <= self.body_height_m <= 0.36:
-            raise ValueError(f"gait: body height {self.body_height_m} m, expected 0.15..0.36")
-
     @cached_property
     def home(self) -> tuple[Vec3, ...]:
         """Foot targets of a level stand at the gait's body height, base frame, m."""
@@ -120,11 +108,6 @@ class GaitOutput(NamedTuple):
 
     feet: tuple[Vec3, ...]
     push: tuple[Vec3, ...]
-
-
-def neutral_feet(config: GaitConfig) -> tuple[Vec3, ...]:
-    """Foot targets of a level stand at the gait's body height, base frame, m."""
-    return config.home
 
 
 def start_gait(config: GaitConfig, yaw_rad: float) -> GaitState:
@@ -250,13 +233,9 @@ def _stand(config: GaitConfig, state: GaitState, body: BodyMotion) -> tuple[Gait
 
 
 def _push(
-    config: GaitConfig,
-    feet: tuple[Vec3, ...],
-    stance: tuple[bool, ...],
-    body: BodyMotion,
-    drive_x_n: float,
-    drive_y_n: float,
-) -> tuple[Vec3, ...]:
+    config: GaitConfig, feet: tuple[Vec3, ...], stance: tuple[bool, ...], body: BodyMotion,
+    drive_x_n: float, drive_y_n: float,
+) -> tuple[Vec3, ...]:  # fmt: skip
     """Share weight, attitude correction and the wanted horizontal force among the stance feet.
 
     Done in forces rather than in foot heights: a rate term in a position target would be differentiated once more by
@@ -289,18 +268,9 @@ def _push(
 
 
 def _feet(
-    config: GaitConfig,
-    feet: tuple[Vec3, ...],
-    lifted: tuple[Vec3, ...],
-    phase: float,
-    period_s: float,
-    ratio: float,
-    height_m: float,
-    carry: Vec3,
-    step_x_m: float,
-    step_y_m: float,
-    dt_s: float,
-) -> tuple[tuple[Vec3, ...], tuple[Vec3, ...], tuple[bool, ...]]:
+    config: GaitConfig, feet: tuple[Vec3, ...], lifted: tuple[Vec3, ...], phase: float, period_s: float, ratio: float,
+    height_m: float, carry: Vec3, step_x_m: float, step_y_m: float, dt_s: float,
+) -> tuple[tuple[Vec3, ...], tuple[Vec3, ...], tuple[bool, ...]]:  # fmt: skip
     ground = FOOT_RADIUS_M - config.body_height_m
     height16 = 16.0 * height_m
     half_stance_s, swing_s = 0.5 * ratio * period_s, (1.0 - ratio) * period_s

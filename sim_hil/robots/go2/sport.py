@@ -65,7 +65,7 @@ _JOINTS = tuple(
 
 
 class SportAction(Enum):
-    """Requests of the sport service that change what the robot is doing."""
+    """Requests of the sport service that change the robot's motion."""
 
     DAMP = "Damp"
     BALANCE_STAND = "BalanceStand"
@@ -76,7 +76,7 @@ class SportAction(Enum):
 
 
 class Measured(NamedTuple):
-    """What the controller reads every step: joints (FR, FL, RR, RL x hip, thigh, calf) and the body."""
+    """Inputs of one controller step: joints (FR, FL, RR, RL x hip, thigh, calf) and the body."""
 
     q_rad: tuple[float, ...]
     dq_radps: tuple[float, ...]
@@ -96,7 +96,7 @@ def _clip(value: float, low: float, high: float) -> float:
 
 
 def motor_torque(joint: int, wanted_nm: float, speed_radps: float) -> float:
-    """What the motor of hip, thigh or calf (0, 1, 2) gives of a wanted torque at a speed.
+    """Return the torque that the motor of hip, thigh or calf (0, 1, 2) reaches at a speed, N.m.
 
     Braking is bounded by the torque limit alone; driving fades to zero towards the velocity limit.
     """
@@ -111,10 +111,10 @@ def motor_torque(joint: int, wanted_nm: float, speed_radps: float) -> float:
 class SportController:
     """The mode machine and its torques. Deterministic; call `step` once every dt_s."""
 
-    def __init__(self, dt_s: float, gait: GaitConfig | None = None) -> None:
+    def __init__(self, dt_s: float) -> None:
         self._dt_s, self._inverse_dt = dt_s, 1.0 / dt_s
-        self._config = gait if gait is not None else GaitConfig()
-        self._mode = MODE_LIE_DOWN
+        self._config = GaitConfig()
+        self.mode = MODE_LIE_DOWN  # SportModeState.mode
         self._time_s = 0.0
         self._motion: _Motion | None = None
         self._awaited: _Motion | None = None  # starts as soon as the trot has come to rest
@@ -130,17 +130,12 @@ class SportController:
     @property
     def trotting(self) -> bool:
         """Whether the legs are stepping, or about to: a standing robot that is pushed over steps too."""
-        return self._motion is None and self._gait.walking and self._mode in _BALANCED
-
-    @property
-    def mode(self) -> int:
-        """SportModeState.mode."""
-        return self._mode
+        return self._motion is None and self._gait.walking and self.mode in _BALANCED
 
     @property
     def gait_type(self) -> int:
         """SportModeState.gait_type: 1 while trotting, else 0."""
-        return 1 if self._mode == MODE_LOCOMOTION else 0
+        return 1 if self.mode == MODE_LOCOMOTION else 0
 
     @property
     def commanded(self) -> Vec3:
@@ -152,8 +147,8 @@ class SportController:
 
     @property
     def ready(self) -> bool:
-        """Whether a velocity command would be obeyed: it stands balanced and no motion is running or awaited."""
-        return self._mode in _BALANCED and self._bound_for is None
+        """Whether the robot would follow a velocity: it stands balanced, and no motion runs or is awaited."""
+        return self.mode in _BALANCED and self._bound_for is None
 
     @property
     def _bound_for(self) -> int | None:
@@ -162,7 +157,7 @@ class SportController:
         return None if motion is None else motion.mode
 
     def request_move(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
-        """Take a velocity; kept one second, clipped to the robot's range, without effect unless it stands balanced."""
+        """Command a velocity for one second, clipped to the robot's range; ignored unless the robot stands balanced."""
         if not self.ready:
             return
         self._command = (
@@ -175,7 +170,7 @@ class SportController:
     def request(self, action: SportAction) -> int:
         """Start an action; return 0, or 4202 where the robot's posture does not allow it."""
         bound_for = self._bound_for
-        arrived = self._mode if bound_for is None else None
+        arrived = self.mode if bound_for is None else None
         if action is SportAction.DAMP:
             self._go_limp()
         elif action is SportAction.STOP_MOVE:
@@ -194,7 +189,7 @@ class SportController:
         elif action is SportAction.RECOVERY_STAND:
             recovering = bound_for in (MODE_BALANCE_STAND, MODE_RECOVERY_STAND)
             if arrived not in _BALANCED and not recovering:
-                self._mode, self._attempts = MODE_RECOVERY_STAND, 0
+                self.mode, self._attempts = MODE_RECOVERY_STAND, 0
                 self._recover()
         return 0
 
@@ -211,7 +206,7 @@ class SportController:
 
     def _go_limp(self) -> None:
         self._forget_command()
-        self._motion, self._awaited, self._mode = None, None, MODE_DAMPING
+        self._motion, self._awaited, self.mode = None, None, MODE_DAMPING
 
     def _forget_command(self) -> None:
         self._command, self._command_s = (0.0, 0.0, 0.0), -HOLD_S
@@ -222,14 +217,14 @@ class SportController:
 
     def _folded(self) -> tuple[float, ...]:
         # A robot that already stands goes straight up or stays; only a collapsed one folds its legs first.
-        if self._mode in _BALANCED:
+        if self.mode in _BALANCED:
             return self._standing()
         return LYING_RAD
 
     def _start(self, keyframes: tuple[tuple[float, tuple[float, ...]], ...], mode: int) -> None:
         self._forget_command()
         self._motion_start_s = self._time_s
-        if self._mode in _BALANCED and self._motion is None and self._gait.walking:
+        if self.mode in _BALANCED and self._motion is None and self._gait.walking:
             # A trot at speed that is broken off topples the robot: it comes to rest first.
             self._awaited = _Motion(keyframes, mode)
         else:
@@ -241,14 +236,14 @@ class SportController:
         self._motion_from = self._latest.q_rad if self._latest is not None else LYING_RAD
 
     def _enter_balance(self) -> None:
-        self._mode = MODE_BALANCE_STAND
+        self.mode = MODE_BALANCE_STAND
         yaw = self._latest.body.yaw_rad if self._latest is not None else 0.0
         self._gait = start_gait(self._config, yaw)
 
     def step(self, measured: Measured) -> tuple[float, ...]:
         """Advance by dt_s; return the 12 joint torques, N.m, within the motors' limits."""
         self._latest = measured
-        fallen = measured.up < 0.5 and self._mode in STANDING_MODES
+        fallen = measured.up < 0.5 and self.mode in STANDING_MODES
         if fallen:
             # A robot that has lost its balance goes limp, as the real one does: flailing breaks it.
             self._go_limp()
@@ -257,13 +252,13 @@ class SportController:
             self._begin(self._awaited)
         if self._motion is not None:
             torques = self._scripted(measured)
-        elif self._mode == MODE_DAMPING:
+        elif self.mode == MODE_DAMPING:
             self._targets = measured.q_rad
             damping = min(_LIMP_DAMPING, _DAMPING_PER_HZ * self._inverse_dt)
             torques = tuple(motor_torque(i % 3, -damping * dq, dq) for i, dq in enumerate(measured.dq_radps))
-        elif self._mode in _BALANCED:
+        elif self.mode in _BALANCED:
             torques = self._walk(measured)
-        elif self._mode == MODE_JOINT_LOCK:
+        elif self.mode == MODE_JOINT_LOCK:
             torques = self._track(measured, self._targets, _HOLD_GAINS, _WEIGHT)
         else:
             torques = self._track(measured, LYING_RAD, _LIE_GAINS, _NO_PUSH)
@@ -273,7 +268,7 @@ class SportController:
     def _walk(self, measured: Measured) -> tuple[float, ...]:
         command = self.commanded
         self._gait, output = step_gait(self._config, self._gait, command, measured.body, self._dt_s)
-        self._mode = MODE_LOCOMOTION if command != (0.0, 0.0, 0.0) else MODE_BALANCE_STAND
+        self.mode = MODE_LOCOMOTION if command != (0.0, 0.0, 0.0) else MODE_BALANCE_STAND
         f0, f1, f2, f3 = output.feet
         targets = (*joint_angles(0, f0), *joint_angles(1, f1), *joint_angles(2, f2), *joint_angles(3, f3))
         gains = _WALK_GAINS if self._gait.walking else _HOLD_GAINS
@@ -292,7 +287,7 @@ class SportController:
             elapsed, begin = elapsed - duration, end
         self._motion = None
         self._targets = begin
-        self._mode = motion.mode
+        self.mode = motion.mode
         if motion.mode == MODE_BALANCE_STAND:
             self._enter_balance()
         elif motion.mode == MODE_RECOVERY_STAND:

@@ -12,9 +12,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from sim_hil.robots.urdf import box, cylinder, inertial, shape, write_urdf, xyz
+
 LEGS = ("FR", "FL", "RR", "RL")
-JOINTS_PER_LEG = ("hip", "thigh", "calf")
-JOINT_NAMES = tuple(f"{leg}_{joint}" for leg in LEGS for joint in JOINTS_PER_LEG)
+JOINT_NAMES = tuple(f"{leg}_{joint}" for leg in LEGS for joint in ("hip", "thigh", "calf"))
 
 HIP_X_M, HIP_Y_M = 0.1934, 0.0465  # hip joint in the base frame
 THIGH_Y_M = 0.0955  # thigh joint sideways of the hip joint
@@ -63,54 +64,29 @@ LEG_GEOMETRY = tuple(
 )
 
 
-def _xyz(*values: float) -> str:
-    return " ".join(f"{value:.6g}" for value in values)
-
-
-def _inertial(mass_kg: float, com: tuple[float, float, float], diagonal: tuple[float, float, float]) -> str:
-    ixx, iyy, izz = diagonal
-    return (
-        f'<inertial><origin xyz="{_xyz(*com)}"/><mass value="{mass_kg:g}"/>'
-        f'<inertia ixx="{ixx:g}" ixy="0" ixz="0" iyy="{iyy:g}" iyz="0" izz="{izz:g}"/></inertial>'
-    )
-
-
-def _shape(tag: str, geometry: str, xyz: tuple[float, ...], rpy: tuple[float, ...] = (0, 0, 0), rgba: str = "") -> str:
-    material = f'<material name="c{rgba.replace(" ", "_")}"><color rgba="{rgba}"/></material>' if rgba else ""
-    return f'<{tag}><origin xyz="{_xyz(*xyz)}" rpy="{_xyz(*rpy)}"/><geometry>{geometry}</geometry>{material}</{tag}>'
-
-
-def _box(x: float, y: float, z: float) -> str:
-    return f'<box size="{_xyz(x, y, z)}"/>'
-
-
-def _cylinder(radius: float, length: float) -> str:
-    return f'<cylinder radius="{radius:g}" length="{length:g}"/>'
-
-
 def _base() -> str:
     quarter = 1.5708
     parts = [
-        _inertial(BASE_MASS_KG, BASE_COM_M, (0.02448, 0.098077, 0.107)),
-        _shape("visual", _box(0.36, 0.10, 0.085), (0, 0, 0.0), rgba=_SILVER),
-        _shape("visual", _box(0.30, 0.065, 0.03), (-0.02, 0, 0.052), rgba=_GREY),
-        _shape("visual", _box(0.30, 0.085, 0.02), (0, 0, -0.05), rgba=_BLACK),
-        _shape("visual", _cylinder(0.052, 0.10), (0.193, 0, 0), (quarter, 0, 0), _GREY),
-        _shape("visual", _cylinder(0.052, 0.10), (-0.193, 0, 0), (quarter, 0, 0), _GREY),
-        _shape("visual", _box(0.10, 0.085, 0.065), (0.262, 0, 0.018), rgba=_SILVER),
-        _shape("visual", _box(0.012, 0.07, 0.045), (0.314, 0, 0.022), rgba=_LENS),
-        _shape("visual", '<sphere radius="0.04"/>', (0.289, 0, -0.046), rgba=_BLACK),
-        _shape("collision", _box(0.3762, 0.0935, 0.114), (0, 0, 0)),
+        inertial(BASE_MASS_KG, BASE_COM_M, (0.02448, 0.098077, 0.107)),
+        shape("visual", box(0.36, 0.10, 0.085), (0, 0, 0.0), rgba=_SILVER),
+        shape("visual", box(0.30, 0.065, 0.03), (-0.02, 0, 0.052), rgba=_GREY),
+        shape("visual", box(0.30, 0.085, 0.02), (0, 0, -0.05), rgba=_BLACK),
+        shape("visual", cylinder(0.052, 0.10), (0.193, 0, 0), (quarter, 0, 0), _GREY),
+        shape("visual", cylinder(0.052, 0.10), (-0.193, 0, 0), (quarter, 0, 0), _GREY),
+        shape("visual", box(0.10, 0.085, 0.065), (0.262, 0, 0.018), rgba=_SILVER),
+        shape("visual", box(0.012, 0.07, 0.045), (0.314, 0, 0.022), rgba=_LENS),
+        shape("visual", '<sphere radius="0.04"/>', (0.289, 0, -0.046), rgba=_BLACK),
+        shape("collision", box(0.3762, 0.0935, 0.114), (0, 0, 0)),
         # The head is what meets a wall first: without it the robot would bump with its feet.
-        _shape("collision", _box(0.12, 0.09, 0.10), (0.262, 0, -0.005)),
+        shape("collision", box(0.12, 0.09, 0.10), (0.262, 0, -0.005)),
     ]
     return f'<link name="base">{"".join(parts)}</link>'
 
 
-def _joint(name: str, kind: str, parent: str, child: str, xyz: tuple[float, ...], rest: str = "") -> str:
+def _joint(name: str, kind: str, parent: str, child: str, offset_m: tuple[float, ...], rest: str = "") -> str:
     return (
         f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
-        f'<origin xyz="{_xyz(*xyz)}"/>{rest}</joint>'
+        f'<origin xyz="{xyz(*offset_m)}"/>{rest}</joint>'
     )
 
 
@@ -127,27 +103,27 @@ def _leg(leg: LegGeometry) -> str:
     hip_x, hip_y = leg.hip_m
     name = leg.name
     hip = (
-        _inertial(HIP_MASS_KG, (-0.0054 * leg.front, 0.00194 * leg.left, -0.000105), (0.00048, 0.000884, 0.000596))
-        + _shape("visual", _cylinder(0.046, 0.045), (0, leg.left * 0.058, 0), (quarter, 0, 0), _SILVER)
-        + _shape("visual", _cylinder(0.036, 0.05), (leg.front * 0.03, leg.left * 0.01, 0), (0, quarter, 0), _BLACK)
-        + _shape("collision", _cylinder(0.046, 0.04), (0, leg.left * 0.08, 0), (quarter, 0, 0))
+        inertial(HIP_MASS_KG, (-0.0054 * leg.front, 0.00194 * leg.left, -0.000105), (0.00048, 0.000884, 0.000596))
+        + shape("visual", cylinder(0.046, 0.045), (0, leg.left * 0.058, 0), (quarter, 0, 0), _SILVER)
+        + shape("visual", cylinder(0.036, 0.05), (leg.front * 0.03, leg.left * 0.01, 0), (0, quarter, 0), _BLACK)
+        + shape("collision", cylinder(0.046, 0.04), (0, leg.left * 0.08, 0), (quarter, 0, 0))
     )
     thigh = (
-        _inertial(THIGH_MASS_KG, (-0.00374, -0.0223 * leg.left, -0.0327), (0.00584, 0.0058, 0.00103))
-        + _shape("visual", _cylinder(0.044, 0.03), (0, 0, 0), (quarter, 0, 0), _GREY)
-        + _shape("visual", _box(0.05, 0.03, 0.20), (0, 0, -0.105), rgba=_SILVER)
-        + _shape("collision", _box(0.034, 0.0245, 0.213), (0, 0, -0.1065))
+        inertial(THIGH_MASS_KG, (-0.00374, -0.0223 * leg.left, -0.0327), (0.00584, 0.0058, 0.00103))
+        + shape("visual", cylinder(0.044, 0.03), (0, 0, 0), (quarter, 0, 0), _GREY)
+        + shape("visual", box(0.05, 0.03, 0.20), (0, 0, -0.105), rgba=_SILVER)
+        + shape("collision", box(0.034, 0.0245, 0.213), (0, 0, -0.1065))
     )
     calf = (
-        _inertial(CALF_MASS_KG, (0.00548, -0.000975 * leg.left, -0.115), (0.00077, 0.00078, 4e-5))
-        + _shape("visual", _cylinder(0.022, 0.03), (0, 0, 0), (quarter, 0, 0), _BLACK)
-        + _shape("visual", _box(0.026, 0.022, 0.20), (0, 0, -0.10), rgba=_GREY)
-        + _shape("collision", _box(0.02, 0.016, 0.16), (0, 0, -0.09))
+        inertial(CALF_MASS_KG, (0.00548, -0.000975 * leg.left, -0.115), (0.00077, 0.00078, 4e-5))
+        + shape("visual", cylinder(0.022, 0.03), (0, 0, 0), (quarter, 0, 0), _BLACK)
+        + shape("visual", box(0.026, 0.022, 0.20), (0, 0, -0.10), rgba=_GREY)
+        + shape("collision", box(0.02, 0.016, 0.16), (0, 0, -0.09))
     )
     foot = (
-        _inertial(FOOT_MASS_KG, (0, 0, 0), (9.6e-6, 9.6e-6, 9.6e-6))
-        + _shape("visual", f'<sphere radius="{FOOT_RADIUS_M}"/>', (0, 0, 0), rgba=_BLACK)
-        + _shape("collision", f'<sphere radius="{FOOT_RADIUS_M}"/>', (0, 0, 0))
+        inertial(FOOT_MASS_KG, (0, 0, 0), (9.6e-6, 9.6e-6, 9.6e-6))
+        + shape("visual", f'<sphere radius="{FOOT_RADIUS_M}"/>', (0, 0, 0), rgba=_BLACK)
+        + shape("collision", f'<sphere radius="{FOOT_RADIUS_M}"/>', (0, 0, 0))
     )
     limits = leg.limits_rad
     return "".join(
@@ -170,15 +146,6 @@ def _leg(leg: LegGeometry) -> str:
     )  # fmt: skip
 
 
-def go2_urdf() -> str:
-    """Return the Go2 as URDF text: base plus four legs of hip, thigh, calf and a fixed foot; SI units."""
-    text = f'<?xml version="1.0"?><robot name="go2">{_base()}{"".join(_leg(leg) for leg in LEG_GEOMETRY)}</robot>'
-    # PyBullet reads lines of at most 8 KiB and breaks longer ones wherever that falls, inside a word too.
-    return text.replace("><", ">\n<") + "\n"
-
-
 def write_go2_urdf(folder: Path) -> Path:
-    """Write the URDF into `folder` (PyBullet only loads files) and return its path."""
-    path = folder / "go2.urdf"
-    path.write_text(go2_urdf(), encoding="utf-8")
-    return path
+    """Write the Go2's URDF, the base and four legs of hip, thigh, calf and a fixed foot; return its path."""
+    return write_urdf("go2", _base() + "".join(_leg(leg) for leg in LEG_GEOMETRY), folder)

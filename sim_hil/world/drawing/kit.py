@@ -120,3 +120,8 @@ class Kit:
 @lru_cache(maxsize=1024)
 def _drawn(drawing: Drawing, kind: str, size_m: Vec3, colour: tuple[float, float, float], text: str) -> Image:
     return drawing(SceneObject("", kind, (0.0, 0.0, 0.0), 0.0, size_m, colour, text))
+
+
+def plate(drawing: Drawing, brightness: float = 0.6) -> Callable[[Kit], None]:
+    """Return a builder of a box with a print on its front; `brightness` of the other sides."""
+    return lambda kit: kit.whole(kit.paint(brightness), kit.picture(drawing))

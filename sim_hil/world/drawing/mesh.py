@@ -113,17 +113,9 @@ class MeshBuilder:
         _fan(self._plain, corners, normals if normals is not None else (_normal(corners),) * len(corners))
 
     def box(
-        self,
-        frame: Frame,
-        centre: Sequence[float],
-        size: Sequence[float],
-        colour: Colour,
-        front: str = "",
-        sides: str = "",
-        back: str = "",
-        top: str = "",
-        bottom: bool = True,
-    ) -> None:
+        self, frame: Frame, centre: Sequence[float], size: Sequence[float], colour: Colour,
+        front: str = "", sides: str = "", back: str = "", top: str = "", bottom: bool = True,
+    ) -> None:  # fmt: skip
         """Add a box in a frame; faces may be textured (front +x, sides +y and -y). `bottom`: include that face."""
         (x, y, z), (a, b, c) = centre, (extent / 2 for extent in size)
 
@@ -180,14 +172,9 @@ class MeshBuilder:
         self.face(colour, tuple(reversed(loops[0])))
 
     def ball(
-        self,
-        frame: Frame,
-        centre: Sequence[float],
-        radii: Sequence[float],
-        colour: Colour,
-        sides: int = 8,
-        levels: int = 6,
-    ) -> None:
+        self, frame: Frame, centre: Sequence[float], radii: Sequence[float], colour: Colour,
+        sides: int = 8, levels: int = 6,
+    ) -> None:  # fmt: skip
         """Add an ellipsoid as a stack of rings."""
         rings = []
         levels = max(round(levels * self._detail), 3)

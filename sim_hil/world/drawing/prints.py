@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from sim_hil.scene.scene import SceneObject
-from sim_hil.world.drawing.textures import DARK, WHITE, Colour, Image, canvas, fill, grain, plain, rgb, write
+from sim_hil.world.drawing.textures import DARK, WHITE, Colour, Image, canvas, fill, front, grain, plain, rgb, write
 
 _GOODS: tuple[Colour, ...] = (
     (200, 60, 50), (50, 110, 190), (236, 190, 60), (70, 150, 90), (230, 230, 224), (220, 120, 50), (130, 80, 160),
@@ -14,13 +14,9 @@ _GOODS: tuple[Colour, ...] = (
 )  # fmt: skip
 
 
-def _front(thing: SceneObject, brightness: float = 1.0) -> Image:
-    return canvas(thing.size_m[1], thing.size_m[2], rgb(thing.colour, brightness))
-
-
 def reception_front(thing: SceneObject) -> Image:
     """Panels of wood and a white band with RECEPTION, or the object's own text."""
-    image = _front(thing, 0.9)
+    image = front(thing, 0.9)
     for index in range(8):
         fill(image, index / 8 + 0.004, 0, (index + 1) / 8 - 0.004, 1, rgb(thing.colour, 1.0 if index % 2 else 1.12))
     fill(image, 0.14, 0.24, 0.86, 0.72, WHITE)
@@ -31,7 +27,7 @@ def reception_front(thing: SceneObject) -> Image:
 
 def books(thing: SceneObject) -> Image:
     """Five rows of books in all colours."""
-    image = _front(thing, 0.5)
+    image = front(thing, 0.5)
     rng = np.random.default_rng(17)
     for row in range(5):
         top, left = 0.03 + row * 0.195, 0.04
@@ -59,7 +55,7 @@ def warning_board(thing: SceneObject) -> Image:
 
 def drawers(thing: SceneObject) -> Image:
     """A cart's drawers, the top one red, with a white cross."""
-    image = _front(thing)
+    image = front(thing)
     tones = ((206, 40, 40), (236, 236, 232), (236, 236, 232), (230, 190, 60))
     for index, tone in enumerate(tones):
         top = 0.08 + index * 0.22
@@ -85,7 +81,7 @@ def heartbeat(thing: SceneObject) -> Image:
 
 def curtain(thing: SceneObject) -> Image:
     """Folds of cloth in a white frame."""
-    image = _front(thing)
+    image = front(thing)
     width = image.shape[1]
     folds = (np.sin(np.arange(width) / width * 2 * np.pi * 12) * 16)[None, :, None]
     folded: Image = np.clip(image + folds, 0, 255).astype(np.uint8)
@@ -116,7 +112,7 @@ def chart(thing: SceneObject) -> Image:
 
 def printer_front(thing: SceneObject) -> Image:
     """Paper trays below, a display and an output slot with paper above."""
-    image = _front(thing)
+    image = front(thing)
     for row in range(3):
         fill(image, 0.05, 0.44 + 0.18 * row, 0.95, 0.60 + 0.18 * row, rgb(thing.colour, 0.86))
         fill(image, 0.38, 0.50 + 0.18 * row, 0.62, 0.53 + 0.18 * row, DARK)
@@ -129,7 +125,7 @@ def printer_front(thing: SceneObject) -> Image:
 
 def coffee_front(thing: SceneObject) -> Image:
     """A coffee machine on a cupboard: COFFEE, a cup in its bay, buttons."""
-    image = _front(thing)
+    image = front(thing)
     fill(image, 0, 0.60, 1, 1, (196, 188, 176))
     fill(image, 0.48, 0.62, 0.52, 0.98, (150, 142, 130))
     fill(image, 0.06, 0.04, 0.94, 0.18, (150, 28, 24))
@@ -143,7 +139,7 @@ def coffee_front(thing: SceneObject) -> Image:
 
 def fridge_front(thing: SceneObject) -> Image:
     """Two doors with long handles and some notes."""
-    image = _front(thing)
+    image = front(thing)
     fill(image, 0, 0.33, 1, 0.345, rgb(thing.colour, 0.5))
     fill(image, 0.06, 0.10, 0.12, 0.30, DARK)
     fill(image, 0.06, 0.40, 0.12, 0.66, DARK)
@@ -197,7 +193,7 @@ def red_white(thing: SceneObject) -> Image:
 
 def storefront_face(thing: SceneObject) -> Image:
     """A shop: its name in large letters over two show windows and a door."""
-    image = _front(thing, 0.8)
+    image = front(thing, 0.8)
     fill(image, 0.0, 0.0, 1.0, 0.30, rgb(thing.colour))
     fill(image, 0.02, 0.03, 0.98, 0.27, rgb(thing.colour, 0.7))
     write(image, thing.text or "SHOP", 0.06, 0.05, 0.94, 0.25, (255, 244, 210))
@@ -257,7 +253,7 @@ def _storeys(thing: SceneObject, width_m: float) -> Image:
 
 def kiosk_face(thing: SceneObject) -> Image:
     """A kiosk's counter with goods under its name."""
-    image = _front(thing)
+    image = front(thing)
     fill(image, 0.04, 0.02, 0.96, 0.20, WHITE)
     write(image, thing.text or "KIOSK", 0.08, 0.03, 0.92, 0.19, rgb(thing.colour, 0.8))
     fill(image, 0.08, 0.28, 0.92, 0.62, (60, 46, 36))
@@ -279,7 +275,7 @@ def leaves(thing: SceneObject) -> Image:
 
 def mail_front(thing: SceneObject) -> Image:
     """MAIL over a slot."""
-    image = _front(thing)
+    image = front(thing)
     fill(image, 0.12, 0.12, 0.88, 0.22, DARK)
     fill(image, 0.12, 0.34, 0.88, 0.66, WHITE)
     write(image, thing.text or "MAIL", 0.16, 0.37, 0.84, 0.63, rgb(thing.colour))

@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
 import pybullet
 
 from sim_hil.world.drawing.mesh import MeshBuilder, Surface
-from sim_hil.world.drawing.textures import palette, write_png
+from sim_hil.world.drawing.textures import png_bytes
 
 Vec3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]  # x, y, z, w
@@ -21,15 +22,12 @@ class Stage(Protocol):
 
     def add(self, mesh: MeshBuilder) -> int:
         """Show a mesh as it was built, and return its handle."""
-        ...
 
     def place(self, handle: int, position_m: Vec3, quaternion_xyzw: Quaternion) -> None:
         """Set a mesh's pose; shows it again if it was hidden."""
-        ...
 
     def hide(self, handle: int) -> None:
         """Hide a mesh until it is placed again."""
-        ...
 
 
 class BulletStage:
@@ -60,8 +58,10 @@ class BulletStage:
             # Its visual shapes take no colours of vertices: they become cells of one palette picture.
             colours = sorted(set(surface.colours))
             cell = {colour: (index + 0.5) / len(colours) for index, colour in enumerate(colours)}
-            image, uvs = palette(colours), [(cell[colour], 0.5) for colour in surface.colours]
-        path = write_png(image, self._folder / f"stage-{self._pictures}.png")
+            image, uvs = np.array([colours], np.uint8), [(cell[colour], 0.5) for colour in surface.colours]
+            image = image.repeat(4, axis=0).repeat(4, axis=1)  # 4 x 4 pixels per colour
+        path = self._folder / f"stage-{self._pictures}.png"
+        path.write_bytes(png_bytes(image))
         self._pictures += 1
         client = self._client
         handle = pybullet.loadTexture(str(path), physicsClientId=client)

@@ -25,7 +25,6 @@ class Tiling:
 
 
 def _grid(colour: Colour, joint: Colour, cells: int, px: int = 192, seed: int = 1, vary: float = 6.0) -> Image:
-    """Square slabs with joints, each a little different in shade."""
     image = plain(px, px, joint)
     rng = np.random.default_rng(seed)
     step = px // cells
@@ -39,7 +38,6 @@ def _grid(colour: Colour, joint: Colour, cells: int, px: int = 192, seed: int = 
 
 
 def _speckle(colour: Colour, seed: int, strength: float, px: int = 192, cell: int = 2) -> Image:
-    """A plain surface with fine and coarse blotches."""
     return grain(grain(plain(px, px, colour), seed, strength, cell), seed + 1, strength * 0.8, 24)
 
 
@@ -106,7 +104,7 @@ def _concrete() -> Image:
 
 
 def _concrete_yellow_line() -> Image:
-    """A line along the heading every 4 m, as it bounds the lanes of a warehouse."""
+    """A line along the heading every 4 m, the boundary of a warehouse's lanes."""
     image = _concrete()
     image[0:7] = image[-7:] = (236, 190, 20)
     return image
@@ -131,15 +129,18 @@ def _asphalt_line() -> Image:
     return image
 
 
-def _cobbles() -> Image:
-    image = plain(160, 160, (92, 86, 80))
-    rng = np.random.default_rng(71)
-    for row in range(10):
-        for column in range(-1, 10):
+def _bricks(
+    joint: Colour, colour: Colour, shares: tuple[int, int, int], width: int, height: int, px: int, seed: int
+) -> Image:  # fmt: skip
+    """Rows of bricks of `width` x `height` pixels, shifted by half a brick; `shares`: divisors of the variation."""
+    image = plain(px, px, joint)
+    rng = np.random.default_rng(seed)
+    for row in range(px // height):
+        for column in range(-1, px // width):
             tone = int(rng.normal(0, 12))
-            x = column * 16 + (8 if row % 2 else 0)
-            colour = (140 + tone, 130 + tone, 120 + tone)
-            cv2.rectangle(image, (x + 1, row * 16 + 1), (x + 14, row * 16 + 14), colour, -1)
+            x, y = column * width + (width // 2 if row % 2 else 0), row * height
+            shade = tuple(channel + tone // share for channel, share in zip(colour, shares, strict=True))
+            cv2.rectangle(image, (x + 1, y + 1), (x + width - 2, y + height - 2), shade, -1)
     return image
 
 
@@ -152,7 +153,7 @@ def _soil() -> Image:
 
 
 def _zebra_crossing() -> Image:
-    """Bars across the heading, which is the way that people walk."""
+    """Bars across the heading, the direction in which people walk."""
     image = np.asarray(cv2.resize(_asphalt(), (128, 128)), np.uint8)
     fill(image, 0.0, 0.0, 0.5, 1.0, (238, 238, 232))
     return image
@@ -192,7 +193,6 @@ def _banded(upper: Colour, lower: Colour, rail: Colour, skirting: Colour, at: fl
 
 
 def _wall_wainscot() -> Image:
-    """Plaster above, a rail, panels and a skirting board below."""
     image = _banded((222, 216, 200), (112, 136, 142), (236, 232, 222), (66, 62, 58))
     for panel in (0.04, 0.54):
         fill(image, panel, 0.67, panel + 0.42, 0.91, (96, 120, 127))
@@ -200,7 +200,6 @@ def _wall_wainscot() -> Image:
 
 
 def _wall_hospital() -> Image:
-    """White above, pale green below, with a bumper rail."""
     return _banded((236, 238, 234), (172, 212, 198), (96, 150, 140), (84, 104, 104), 0.66)
 
 
@@ -224,24 +223,11 @@ def _wall_glass() -> Image:
 
 
 def _wall_warehouse() -> Image:
-    """Ribbed sheet metal over a concrete plinth."""
     image = plain(192, 256, (178, 186, 192))
     for left in range(0, 192, 16):
         image[:, left : left + 5] = (158, 166, 172)
     fill(image, 0, 0.80, 1, 1, (138, 136, 130))
     fill(image, 0, 0.79, 1, 0.81, (214, 170, 30))
-    return image
-
-
-def _wall_brick() -> Image:
-    image = plain(192, 192, (196, 186, 176))
-    rng = np.random.default_rng(5)
-    for row in range(16):
-        for column in range(-1, 6):
-            tone = int(rng.normal(0, 12))
-            x = column * 32 + (16 if row % 2 else 0)
-            colour = (164 + tone, 84 + tone // 2, 64 + tone // 2)
-            cv2.rectangle(image, (x + 1, row * 12 + 1), (x + 30, row * 12 + 10), colour, -1)
     return image
 
 
@@ -258,7 +244,6 @@ def _wall_plaster() -> Image:
 
 
 def _railing() -> Image:
-    """Bars between two rails, before a pale ground."""
     image = plain(192, 96, (190, 198, 204))
     for left in range(4, 192, 16):
         image[:, left : left + 5] = (60, 66, 72)
@@ -274,7 +259,6 @@ def _ceiling_panels() -> Image:
 
 
 def _ceiling_steel() -> Image:
-    """Corrugated deck on girders."""
     image = plain(128, 128, (150, 156, 162))
     for top in range(0, 128, 8):
         image[top : top + 3] = (132, 138, 144)
@@ -301,7 +285,7 @@ SURFACES: dict[str, Tiling] = {
     "asphalt_line": Tiling(_asphalt_line, 4.0, 4.0),
     "paving": Tiling(lambda: _grid((164, 160, 152), (126, 122, 116), 4, seed=101, vary=8.0), 2.4, 2.4),
     "paving_light": Tiling(lambda: _grid((206, 200, 188), (170, 164, 152), 3, seed=103, vary=6.0), 2.4, 2.4),
-    "cobbles": Tiling(_cobbles, 1.5, 1.5),
+    "cobbles": Tiling(lambda: _bricks((92, 86, 80), (140, 130, 120), (1, 1, 1), 16, 16, 160, 71), 1.5, 1.5),
     "grass": Tiling(_grass, 3.0, 3.0),
     "soil": Tiling(_soil, 2.0, 2.0),
     "zebra_crossing": Tiling(_zebra_crossing, 1.0, 4.0),
@@ -313,7 +297,7 @@ SURFACES: dict[str, Tiling] = {
     "wall_office": Tiling(_wall_office, 2.0, 0.0),
     "wall_glass": Tiling(_wall_glass, 2.4, 0.0),
     "wall_warehouse": Tiling(_wall_warehouse, 3.0, 0.0),
-    "wall_brick": Tiling(_wall_brick, 1.6, 1.6),
+    "wall_brick": Tiling(lambda: _bricks((196, 186, 176), (164, 84, 64), (1, 2, 2), 32, 12, 192, 5), 1.6, 1.6),
     "wall_concrete": Tiling(_wall_concrete, 2.4, 2.4),
     "wall_plaster": Tiling(_wall_plaster, 2.0, 2.0),
     "railing": Tiling(_railing, 2.0, 0.0),

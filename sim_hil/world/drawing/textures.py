@@ -6,8 +6,6 @@ shows most objects with few pixels, so the textures have broad shapes and large 
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +62,11 @@ def canvas(width_m: float, height_m: float, colour: Colour) -> Image:
     return plain(max(round(width_m * scale), 8), max(round(height_m * scale), 8), colour)
 
 
+def front(thing: SceneObject, brightness: float = 1.0) -> Image:
+    """Return an image of the object's colour for its front."""
+    return canvas(thing.size_m[1], thing.size_m[2], rgb(thing.colour, brightness))
+
+
 def grain(image: Image, seed: int, strength: float, cell: int) -> Image:
     """Add soft blotches to a plain surface, as texture for optical flow."""
     height, width = image.shape[:2]
@@ -75,9 +78,7 @@ def grain(image: Image, seed: int, strength: float, cell: int) -> Image:
 
 def vending_front(thing: SceneObject) -> Image:
     """Front of a drinks machine: lit banner with lettering, glass with cans on shelves, keypad, delivery flap."""
-    _, width, height = thing.size_m
-    body = rgb(thing.colour)
-    image = canvas(width, height, body)
+    image = front(thing)
     fill(image, 0.04, 0.025, 0.96, 0.15, (20, 60, 170))
     fill(image, 0.04, 0.15, 0.96, 0.165, (255, 240, 120))
     write(image, thing.text or "DRINKS", 0.07, 0.04, 0.93, 0.135, (255, 255, 255))
@@ -122,8 +123,7 @@ def vending_side(thing: SceneObject) -> Image:
 
 def door(thing: SceneObject) -> Image:
     """A door in its frame with two panels, handle and number plate."""
-    _, width, height = thing.size_m
-    image = canvas(width, height, rgb(thing.colour, 0.55))
+    image = front(thing, 0.55)
     fill(image, 0.07, 0.035, 0.93, 1, rgb(thing.colour))
     for top, bottom in ((0.24, 0.52), (0.62, 0.92)):
         fill(image, 0.19, top, 0.81, bottom, rgb(thing.colour, 0.8))
@@ -144,8 +144,7 @@ def sign(thing: SceneObject) -> Image:
 
 def notice_board(thing: SceneObject) -> Image:
     """A cork board with a headline and pinned sheets."""
-    _, width, height = thing.size_m
-    image = grain(canvas(width, height, rgb(thing.colour)), 3, 9.0, 4)
+    image = grain(front(thing), 3, 9.0, 4)
     write(image, thing.text, 0.25, 0.06, 0.75, 0.17, (70, 30, 20))
     sheets = (
         (0.07, 0.24, 0.27, 0.58, WHITE), (0.32, 0.22, 0.52, 0.50, (255, 240, 150)), (0.58, 0.25, 0.74, 0.60, WHITE),
@@ -164,8 +163,7 @@ def notice_board(thing: SceneObject) -> Image:
 
 def window(thing: SceneObject) -> Image:
     """A bright window: sky over a line of trees, white frame and cross bar."""
-    _, width, height = thing.size_m
-    image = canvas(width, height, rgb(thing.colour))
+    image = front(thing)
     fill(image, 0, 0.66, 1, 1, (96, 140, 84))
     for tree in range(5):
         centre = (round((0.1 + 0.2 * tree) * image.shape[1]), round(0.64 * image.shape[0]))
@@ -189,8 +187,7 @@ def dispenser_front(thing: SceneObject) -> Image:
 
 def bin_front(thing: SceneObject) -> Image:
     """Front of a trash bin: dark slot and a white label."""
-    _, width, height = thing.size_m
-    image = canvas(width, height, rgb(thing.colour))
+    image = front(thing)
     fill(image, 0.14, 0.08, 0.86, 0.24, DARK)
     fill(image, 0.16, 0.45, 0.84, 0.72, WHITE)
     write(image, "TRASH", 0.19, 0.48, 0.81, 0.69, rgb(thing.colour))
@@ -199,20 +196,11 @@ def bin_front(thing: SceneObject) -> Image:
 
 def cabinet_front(thing: SceneObject) -> Image:
     """Front of a metal cabinet with two doors and handles."""
-    _, width, height = thing.size_m
-    image = canvas(width, height, rgb(thing.colour))
+    image = front(thing)
     for left in (0.03, 0.515):
         fill(image, left, 0.05, left + 0.455, 0.95, rgb(thing.colour, 1.18))
     fill(image, 0.44, 0.42, 0.465, 0.58, DARK)
     fill(image, 0.535, 0.42, 0.56, 0.58, DARK)
-    return image
-
-
-def palette(colours: list[Colour]) -> Image:
-    """Return an image with one 4 x 4 cell per colour, so that many plain surfaces share one mesh."""
-    image = np.zeros((4, 4 * max(len(colours), 1), 3), np.uint8)
-    for index, colour in enumerate(colours):
-        image[:, 4 * index : 4 * index + 4] = colour
     return image
 
 
@@ -222,9 +210,3 @@ def png_bytes(image: Image) -> bytes:
     if not done:
         raise OSError("the picture could not be encoded as PNG")
     return bytes(data)
-
-
-def write_png(image: Image, path: Path) -> Path:
-    """Write an RGB image to a file. Raises OSError on failure."""
-    path.write_bytes(png_bytes(image))
-    return path

@@ -26,7 +26,7 @@ from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
 from edge.state.switches import Decoding, RecoverySwitch
 from export.cli import main
-from export.target.file import load_target
+from export.targets.file import load_target
 from tests.support.artifact_directory import edit_manifest
 
 

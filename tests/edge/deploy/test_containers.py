@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from edge.deploy import dds_binding
-from edge.deploy.service_users import BRIDGE_USER, OPERATOR_GROUP, RUNNER_USER
+from edge.deploy.unit_text import BRIDGE_USER, OPERATOR_GROUP, RUNNER_USER
 from firmware_bridge.core.config import BRIDGE_PRIORITY
 from tests.support.processes import REPOSITORY
 from tests.test_docs import code, scripts

@@ -23,14 +23,11 @@ from edge.deploy.doctor.check import Check, Level
 from edge.deploy.doctor.command import examine, main, parser
 from edge.deploy.doctor.graphs import Placement, judge_placement, judge_ticks, placements, profile_graph
 from edge.deploy.doctor.robot import bridge, robot_link
-from edge.deploy.install import main as install
 from edge.inference.graph import CPU_PROVIDER
-from export.target.file import load_target
-from firmware_bridge.client import BridgeUnavailable
+from export.targets.file import load_target
 from firmware_bridge.core.config import RobotConfig, load_robot_config
 from firmware_bridge.core.link import BridgeStatus
-from firmware_bridge.unitree.client import CameraError
-from firmware_bridge.unitree.dds import DdsError
+from firmware_bridge.core.robot_state import CameraError, DdsError
 from tests.support.processes import GO2_SIM
 
 PLAN = PlanFacts(100.0, 60.0, 40.0, 0.2, 1100, 4 * GIB, "modelled")
@@ -60,34 +57,28 @@ def test_a_profile_that_does_not_tell_is_refused(events: Sequence[Any]) -> None:
         placements(events)
 
 
-def judged(*places: Placement) -> Check:
-    return judge_placement("vision_encoder", CUDA, places)
-
-
-ON_CUDA = Placement(CUDA, "MatMul", 100, 1 << 20, 5000)
-
-
-def test_a_graph_that_is_all_on_its_provider_is_fine() -> None:
-    assert judged(ON_CUDA).level is Level.OK
-
-
-def test_one_node_that_fell_back_to_the_processor_fails_and_is_named() -> None:
-    check = judged(ON_CUDA, Placement(CPU_PROVIDER, "LayerNormalization", 1, 1 << 20, 1500))
-    assert check.level is Level.FAIL
-    assert "1 LayerNormalization on CPUExecutionProvider take 1.50 ms" in check.found
-
-
-def test_nodes_that_reckon_with_shapes_belong_on_the_processor() -> None:
-    assert judged(ON_CUDA, Placement(CPU_PROVIDER, "Gather", 3, 32, 5)).level is Level.OK
-    assert judged(ON_CUDA, Placement(CPU_PROVIDER, "MemcpyToHost", 2, 1 << 20, 50)).level is Level.OK
-
-
-def test_the_same_operator_on_real_data_does_not() -> None:
-    assert judged(ON_CUDA, Placement(CPU_PROVIDER, "Gather", 1, 1 << 20, 900)).level is Level.FAIL
-
-
-def test_a_third_provider_is_no_harmless_place() -> None:
-    assert judged(ON_CUDA, Placement("OpenVINOExecutionProvider", "Shape", 1, 8, 1)).level is Level.FAIL
+@pytest.mark.parametrize(
+    ("places", "level", "found"),
+    [
+        ([], Level.OK, ""),
+        (
+            [Placement(CPU_PROVIDER, "LayerNormalization", 1, 1 << 20, 1500)],
+            Level.FAIL,
+            "1 LayerNormalization on CPUExecutionProvider take 1.50 ms",
+        ),
+        ([Placement(CPU_PROVIDER, "Gather", 3, 32, 5)], Level.OK, ""),
+        ([Placement(CPU_PROVIDER, "MemcpyToHost", 2, 1 << 20, 50)], Level.OK, ""),
+        ([Placement(CPU_PROVIDER, "Gather", 1, 1 << 20, 900)], Level.FAIL, ""),
+        ([Placement("OpenVINOExecutionProvider", "Shape", 1, 8, 1)], Level.FAIL, ""),
+    ],
+    ids=["all on CUDA", "fell back", "shapes", "copies", "the same operator on real data", "a third provider"],
+)
+def test_only_nodes_that_compute_shapes_may_run_on_the_processor(
+    places: list[Placement], level: Level, found: str
+) -> None:
+    on_cuda = Placement(CUDA, "MatMul", 100, 1 << 20, 5000)
+    check = judge_placement("vision_encoder", CUDA, [on_cuda, *places])
+    assert check.level is level and found in check.found
 
 
 def test_every_graph_of_real_artifacts_runs_where_its_manifest_says(artifacts: Artifacts) -> None:
@@ -107,16 +98,20 @@ def test_a_graph_that_onnx_runtime_quietly_runs_on_the_processor_instead_fails(a
 
 
 @pytest.mark.parametrize(
-    ("times_ms", "level"),
-    [([40.0] * 50, Level.OK), ([59.0] * 50, Level.OK), ([61.0] * 50, Level.WARN), ([40.0] * 9 + [150.0], Level.FAIL)],
+    ("times_ms", "plan", "level"),
+    [
+        ([40.0] * 50, PLAN, Level.OK),
+        ([59.0] * 50, PLAN, Level.OK),
+        ([61.0] * 50, PLAN, Level.WARN),
+        ([40.0] * 9 + [150.0], PLAN, Level.FAIL),
+        ([99.0] * 10, None, Level.OK),
+        ([], None, Level.SKIP),
+    ],
 )
-def test_ticks_are_held_against_the_plan_and_the_period(times_ms: list[float], level: Level) -> None:
-    assert judge_ticks(times_ms, PLAN, 100).level is level
-
-
-def test_without_a_plan_only_the_period_counts() -> None:
-    assert judge_ticks([99.0] * 10, None, 100).level is Level.OK
-    assert judge_ticks([], None, 100).level is Level.SKIP
+def test_ticks_are_compared_with_the_plan_and_the_period(
+    times_ms: list[float], plan: PlanFacts | None, level: Level
+) -> None:
+    assert judge_ticks(times_ms, plan, 100).level is level
 
 
 @pytest.fixture(scope="module")
@@ -124,27 +119,25 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> RobotConfig:
     return load_robot_config(GO2_SIM, socket=tmp_path_factory.mktemp("run") / "bridge.sock")
 
 
-def status(state: str, blocked_by: str = "none") -> BridgeStatus:
-    return BridgeStatus(1, state, "why", 0, 0, 0, (0.0, 0.0, 0.0), True, "none", blocked_by)
+@pytest.mark.parametrize(
+    ("state", "blocked_by", "level", "text"),
+    [
+        ("disarmed", "none", Level.OK, ""),
+        ("stopped", "estop", Level.FAIL, "`edge-bridge arm` while a runner waits"),
+        ("disarmed", "operator", Level.OK, "waits for `edge-bridge arm`"),
+    ],
+)
+def test_a_bridge_that_would_refuse_to_arm_fails_and_tells_why(
+    robot: RobotConfig, state: str, blocked_by: str, level: Level, text: str
+) -> None:
+    status = BridgeStatus(1, state, "why", 0, 0, 0, (0.0, 0.0, 0.0), True, "none", blocked_by)
+    check = bridge(robot, lambda _robot: status)
+    assert check.level is level and text in check.found + check.advice
 
 
-def test_a_bridge_that_would_arm_is_fine(robot: RobotConfig) -> None:
-    assert bridge(robot, lambda _robot: status("disarmed")).level is Level.OK
-
-
-def test_a_bridge_that_would_refuse_says_why(robot: RobotConfig) -> None:
-    check = bridge(robot, lambda _robot: status("stopped", "estop"))
-    assert (check.level, "estop" in check.found) == (Level.FAIL, True)
-    assert "`edge-bridge arm` while a runner waits" in check.advice
-
-
-def test_a_bridge_that_waits_for_its_operator_is_fine_and_says_so(robot: RobotConfig) -> None:
-    check = bridge(robot, lambda _robot: status("disarmed", "operator"))
-    assert (check.level, "edge-bridge arm" in check.found) == (Level.OK, True)
-
-
-def test_a_bridge_that_is_not_there_fails(robot: RobotConfig) -> None:
-    assert bridge(robot).level is Level.FAIL
+def test_a_bridge_that_is_not_there_fails_in_one_line(robot: RobotConfig) -> None:
+    check = bridge(robot)
+    assert check.level is Level.FAIL and "\n" not in check.found
 
 
 def jpeg(value: int | None) -> bytes:
@@ -176,34 +169,34 @@ class FakeRobot:
         self.closed = True
 
 
-def levels(robot: RobotConfig, fake: FakeRobot) -> list[Level]:
-    found = [check.level for check in robot_link(robot, 224, open_reader=lambda _robot: fake, timeout_s=0.0)]
+def checked(robot: RobotConfig, fake: FakeRobot) -> list[Check]:
+    checks = robot_link(robot, 224, open_reader=lambda _robot: fake, timeout_s=0.0)
     assert fake.closed
-    return found
-
-
-def test_a_robot_that_reports_and_shows_a_picture_is_fine(robot: RobotConfig) -> None:
-    assert levels(robot, FakeRobot(jpeg(None))) == [Level.OK, Level.OK]
-
-
-def test_a_second_robot_on_the_network_fails_and_is_named(robot: RobotConfig) -> None:
-    fake = FakeRobot(jpeg(None), surplus="2 publishers of rt/sportmodestate, expected 1")
-    check = robot_link(robot, 224, open_reader=lambda _robot: fake, timeout_s=0.0)[0]
-    assert (check.level, "2 publishers of rt/sportmodestate" in check.found) == (Level.FAIL, True)
-    assert "two robots" in check.advice
-
-
-def test_the_camera_of_a_silent_robot_is_not_asked(robot: RobotConfig) -> None:
-    assert levels(robot, FakeRobot(jpeg(None), silent=True)) == [Level.FAIL, Level.SKIP]
+    return checks
 
 
 @pytest.mark.parametrize(
-    "frame",
-    [CameraError("camera: no answer"), b"\xff\xd8 no picture", b"", jpeg(0)],
-    ids=["none", "torn", "0", "black"],
+    ("fake", "levels"),
+    [
+        (FakeRobot(jpeg(None)), [Level.OK, Level.OK]),
+        (FakeRobot(jpeg(None), silent=True), [Level.FAIL, Level.SKIP]),
+        (FakeRobot(CameraError("camera: no answer")), [Level.OK, Level.FAIL]),
+        (FakeRobot(b"\xff\xd8 no picture"), [Level.OK, Level.FAIL]),
+        (FakeRobot(b""), [Level.OK, Level.FAIL]),
+        (FakeRobot(jpeg(0)), [Level.OK, Level.FAIL]),
+    ],
+    ids=["fine", "silent", "no picture", "torn", "empty", "black"],
 )
-def test_a_camera_without_a_usable_picture_fails(robot: RobotConfig, frame: bytes | Exception) -> None:
-    assert levels(robot, FakeRobot(frame)) == [Level.OK, Level.FAIL]
+def test_a_robot_must_report_its_state_and_give_a_picture(
+    robot: RobotConfig, fake: FakeRobot, levels: list[Level]
+) -> None:
+    assert [check.level for check in checked(robot, fake)] == levels
+
+
+def test_a_second_robot_on_the_network_fails_and_is_named(robot: RobotConfig) -> None:
+    check = checked(robot, FakeRobot(jpeg(None), surplus="2 publishers of rt/sportmodestate, expected 1"))[0]
+    assert (check.level, "2 publishers of rt/sportmodestate" in check.found) == (Level.FAIL, True)
+    assert "two robots" in check.advice
 
 
 def test_a_bus_that_cannot_be_joined_fails(robot: RobotConfig) -> None:
@@ -234,7 +227,7 @@ def test_real_artifacts_on_the_machine_that_they_are_for(artifacts_dir: Path, tm
     assert sum(result["counts"].values()) == len(result["checks"])
 
 
-def test_what_is_not_given_is_said_to_be_skipped(tmp_path: Path) -> None:
+def test_what_is_not_given_is_shown_as_skipped(tmp_path: Path) -> None:
     _, result = run(tmp_path, "--logs", str(tmp_path))
     checks = by_name(result)
     for name in ("artifacts", "target", "tick", "robot file"):
@@ -244,19 +237,19 @@ def test_what_is_not_given_is_said_to_be_skipped(tmp_path: Path) -> None:
 
 def test_artifacts_of_another_target_fail(artifacts_dir: Path, tmp_path: Path) -> None:
     code, result = run(tmp_path, "--artifacts", str(artifacts_dir), "--target", "orin", "--ticks", "0")
-    assert code == EXIT_CHECK_FAILED
-    assert by_name(result)["artifacts"]["level"] == "fail"
+    assert (code, by_name(result)["artifacts"]["level"]) == (EXIT_CHECK_FAILED, "fail")
 
 
-def test_artifacts_that_do_not_verify_fail_and_the_rest_is_still_looked_at(tmp_path: Path) -> None:
-    code, result = run(tmp_path, "--artifacts", str(tmp_path / "none"))
+def test_what_cannot_be_opened_fails_and_the_rest_is_still_checked(tmp_path: Path) -> None:
+    code, result = run(tmp_path, "--artifacts", str(tmp_path / "none"), "--robot", str(tmp_path / "none.toml"))
+    checks = by_name(result)
     assert code == EXIT_CHECK_FAILED
-    assert by_name(result)["artifacts"]["level"] == "fail"
-    assert "clock" in by_name(result)
+    assert checks["artifacts"]["level"] == checks["robot file"]["level"] == "fail"
+    assert "clock" in checks
 
 
 @pytest.mark.slow
-def test_a_manifest_that_says_nonsense_of_its_device_is_a_failure_among_others(
+def test_a_manifest_that_is_wrong_about_its_device_is_a_failure_among_others(
     artifacts_dir: Path, tmp_path: Path
 ) -> None:
     copy = Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))
@@ -293,19 +286,6 @@ def test_missing_engines_fail_with_the_command_that_builds_them(artifacts_dir: P
     assert checks["tick"].level is Level.SKIP
 
 
-def test_a_robot_file_that_is_wrong_fails(tmp_path: Path) -> None:
-    code, result = run(tmp_path, "--robot", str(tmp_path / "none.toml"))
-    assert (code, by_name(result)["robot file"]["level"]) == (EXIT_CHECK_FAILED, "fail")
-
-
-def test_help_has_examples_and_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
-    for command in (main, install):
-        with pytest.raises(SystemExit) as ended:
-            command(["--help"])
-        text = capsys.readouterr().out
-        assert (ended.value.code, "examples:" in text, "exit codes:" in text) == (0, True, True)
-
-
 def test_bad_arguments_are_bad_input(tmp_path: Path) -> None:
     assert main(["--ticks", "-1"]) == EXIT_BAD_INPUT
     assert main(["--json", str(tmp_path)]) == EXIT_BAD_INPUT
@@ -318,16 +298,6 @@ def test_with_a_dash_standard_output_is_the_json_alone(tmp_path: Path, capsys: p
     assert "clock" in output.err
 
 
-def test_the_target_and_plan_are_read_from_the_manifest(artifacts_dir: Path) -> None:
-    manifest = json.loads((artifacts_dir / "manifest.json").read_text())
-    target, facts, plan = load_target("cpu", "nano"), target_facts(manifest), plan_facts(manifest)
-    assert facts is not None
-    assert plan is not None
-    assert (facts.name, facts.architectures, facts.cores) == ("cpu", target.arch, target.device.cores)
-    assert facts.memory_bytes - facts.available_bytes == target.device.reserved_gib * GIB
-    assert plan.memory_bytes == manifest["plan"]["memory_bytes"]
-
-
 @pytest.mark.parametrize(
     "change",
     [
@@ -338,20 +308,8 @@ def test_the_target_and_plan_are_read_from_the_manifest(artifacts_dir: Path) -> 
         {"provenance": None},
     ],
 )
-def test_a_manifest_that_says_nonsense_of_its_device_is_refused(change: dict[str, Any]) -> None:
+def test_a_manifest_that_is_wrong_about_its_device_is_refused(change: dict[str, Any]) -> None:
     manifest = {"plan": {}, "provenance": {}, **change}
     with pytest.raises(ArtifactError):
         target_facts(manifest)
         plan_facts(manifest)
-
-
-def test_a_manifest_without_target_and_plan_has_neither() -> None:
-    assert target_facts({"provenance": {}}) is None
-    assert plan_facts({"plan": {}}) is None
-
-
-def test_no_bridge_at_a_path_is_told_in_one_line(robot: RobotConfig) -> None:
-    def gone(_robot: RobotConfig) -> BridgeStatus | None:
-        raise BridgeUnavailable("no bridge listens at x (No such file); start `edge-bridge`")
-
-    assert "\n" not in bridge(robot, gone).found

@@ -1,4 +1,4 @@
-"""`edge-doctor` on machines made of files: what it finds, what it expects, what it says to do."""
+"""`edge-doctor` on machines made of files: what it finds, what it expects, what to do; and on the robot's cable."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from edge.deploy.doctor.machine import (
     disk,
     match,
     memory,
-    mode_cores,
     power_mode,
     processor_ticks,
     wall_clock,
 )
+from edge.deploy.doctor.robot import cable
 from edge.inference.graph import CPU_PROVIDER
 
 ORIN = TargetFacts("orin", ("aarch64",), 8, 16 * GIB, 12 * GIB, "36.4", "40W", 25.0)
@@ -50,43 +50,27 @@ def write(root: Path, files: dict[str, str]) -> Path:
     return root
 
 
-def mode(root: Path, wanted: str, said: str | None, online: str = "0-1,4") -> Check:
-    write(root, {"etc/nvpmodel.conf": CONF, "sys/devices/system/cpu/online": f"{online}\n"})
-    return power_mode(wanted, root, lambda: said)
-
-
-def test_the_power_mode_is_known_by_its_name(tmp_path: Path) -> None:
-    assert mode(tmp_path, "40W", "NV Power Mode: 40W\n4\n").level is Level.OK
-
-
-def test_another_power_mode_fails_with_the_command_that_sets_it(tmp_path: Path) -> None:
-    check = mode(tmp_path, "40W", "NV Power Mode: 10W\n1\n")
-    assert check.level is Level.FAIL
-    assert "sudo nvpmodel -m 4" in check.advice
-
-
-def test_a_mode_that_the_board_has_not_is_named_with_those_that_it_has(tmp_path: Path) -> None:
-    check = mode(tmp_path, "25W", "NV Power Mode: 10W\n1\n")
-    assert (check.level, "10W, 40W" in check.found) == (Level.FAIL, True)
-
-
-def test_a_mode_that_nvpmodel_reports_but_the_cores_do_not_show_fails(tmp_path: Path) -> None:
-    check = mode(tmp_path, "10W", "NV Power Mode: 10W\n1\n")
-    assert check.level is Level.FAIL
-    assert "reboot" in check.advice
-
-
-def test_an_nvpmodel_that_does_not_answer_fails(tmp_path: Path) -> None:
-    assert mode(tmp_path, "40W", None).level is Level.FAIL
+@pytest.mark.parametrize(
+    ("wanted", "answer", "level", "text"),
+    [
+        ("40W", "NV Power Mode: 40W\n4\n", Level.OK, ""),
+        ("40W", "NV Power Mode: 10W\n1\n", Level.FAIL, "sudo nvpmodel -m 4"),
+        ("25W", "NV Power Mode: 10W\n1\n", Level.FAIL, "10W, 40W"),
+        ("10W", "NV Power Mode: 10W\n1\n", Level.FAIL, "reboot"),
+        ("40W", None, Level.FAIL, ""),
+    ],
+    ids=["as wanted", "another", "unknown to the board", "reported, but its cores are not online", "no answer"],
+)
+def test_the_power_mode_is_known_by_its_name_and_its_cores(
+    tmp_path: Path, wanted: str, answer: str | None, level: Level, text: str
+) -> None:
+    write(tmp_path, {"etc/nvpmodel.conf": CONF, "sys/devices/system/cpu/online": "0-1,4\n"})
+    check = power_mode(wanted, tmp_path, lambda: answer)
+    assert check.level is level and text in check.found + check.advice
 
 
 def test_without_its_configuration_this_is_no_jetson(tmp_path: Path) -> None:
     assert power_mode("default", tmp_path, lambda: None).level is Level.SKIP
-
-
-def test_the_cores_of_a_mode_are_those_of_its_own_block() -> None:
-    assert mode_cores(CONF, "10W") == {0, 1}
-    assert mode_cores(CONF, "15W") == set()
 
 
 @pytest.mark.parametrize(
@@ -100,7 +84,7 @@ def test_a_list_of_cores_is_read(text: str, cores: set[int]) -> None:
     ("governors", "level"),
     [(["performance"], Level.OK), (["performance", "schedutil"], Level.WARN), ([], Level.SKIP)],
 )
-def test_a_governor_that_follows_the_load_is_told(tmp_path: Path, governors: list[str], level: Level) -> None:
+def test_a_governor_that_follows_the_load_is_a_warning(tmp_path: Path, governors: list[str], level: Level) -> None:
     cpu = "sys/devices/system/cpu"
     write(tmp_path, {f"{cpu}/cpu{n}/cpufreq/scaling_governor": f"{name}\n" for n, name in enumerate(governors)})
     assert cpu_governor(tmp_path).level is level
@@ -113,14 +97,10 @@ def devfreq(root: Path, low: int, high: int) -> Path:
     return write(root, {f"{gpu}/{name}": f"{text}\n" for name, text in files.items()})
 
 
-def test_a_graphics_clock_that_may_fall_is_told(tmp_path: Path) -> None:
+def test_a_graphics_clock_that_may_fall_is_a_warning_and_one_that_stays_is_fine(tmp_path: Path) -> None:
     check = clocks(devfreq(tmp_path, 306_000_000, 408_000_000))
     assert check.level is Level.WARN
-    assert "jetson_clocks" in check.advice
-    assert "of 1173" in check.found
-
-
-def test_a_graphics_clock_that_stays_is_fine(tmp_path: Path) -> None:
+    assert "jetson_clocks" in check.advice and "of 1173" in check.found
     assert clocks(devfreq(tmp_path, 408_000_000, 408_000_000)).level is Level.OK
 
 
@@ -133,23 +113,22 @@ def jetson(root: Path, revision: str = "4.3") -> Path:
     return write(root, {"etc/nv_tegra_release": f"# R36 (release), REVISION: {revision}, GCID: 1\n"})
 
 
-def test_the_device_that_the_artifacts_were_made_for_is_fine(tmp_path: Path) -> None:
-    assert match(ORIN, [CUDA], "aarch64", [CUDA, CPU_PROVIDER], jetson(tmp_path)).level is Level.OK
-
-
-def test_another_processor_fails(tmp_path: Path) -> None:
-    check = match(ORIN, [CUDA], "x86_64", [CUDA], jetson(tmp_path))
-    assert (check.level, "export for this machine" in check.advice) == (Level.FAIL, True)
-
-
-def test_an_older_jetpack_fails_by_its_number_and_not_its_spelling(tmp_path: Path) -> None:
-    assert match(ORIN, [CUDA], "aarch64", [CUDA], jetson(tmp_path, "3.0")).level is Level.FAIL
-    assert match(ORIN, [CUDA], "aarch64", [CUDA], jetson(tmp_path, "10.0")).level is Level.OK
-
-
-def test_a_provider_that_this_onnx_runtime_lacks_fails(tmp_path: Path) -> None:
-    check = match(ORIN, [CUDA], "aarch64", [CPU_PROVIDER], jetson(tmp_path))
-    assert (check.level, check.expected) == (Level.FAIL, CUDA)
+@pytest.mark.parametrize(
+    ("machine", "available", "revision", "level", "text"),
+    [
+        ("aarch64", [CUDA, CPU_PROVIDER], "4.3", Level.OK, ""),
+        ("x86_64", [CUDA], "4.3", Level.FAIL, "export for this machine"),
+        ("aarch64", [CUDA], "3.0", Level.FAIL, "JetPack"),
+        ("aarch64", [CUDA], "10.0", Level.OK, ""),
+        ("aarch64", [CPU_PROVIDER], "4.3", Level.FAIL, "ONNX Runtime package"),
+    ],
+    ids=["the device itself", "another processor", "an older JetPack", "a newer JetPack", "no provider"],
+)
+def test_the_machine_is_compared_with_the_one_that_the_artifacts_are_for(
+    tmp_path: Path, machine: str, available: list[str], revision: str, level: Level, text: str
+) -> None:
+    check = match(ORIN, [CUDA], machine, available, jetson(tmp_path, revision))
+    assert check.level is level and text in check.advice
 
 
 def sized(root: Path, cores: int, gib: float, module: str = "") -> Path:
@@ -188,6 +167,7 @@ def test_an_ordinary_machine_may_have_more_than_its_target_and_a_cards_memory_is
 
 def test_a_plan_for_a_cards_own_memory_is_not_held_against_the_machines(tmp_path: Path) -> None:
     write(tmp_path, {"proc/meminfo": "MemAvailable:   1048576 kB\n"})
+    assert memory(None, tmp_path).level is Level.SKIP
     check = memory(PLAN, tmp_path, own_memory=True)
     assert (check.level, "1.00 GiB" in check.found) == (Level.SKIP, True)
 
@@ -196,10 +176,6 @@ def test_a_plan_for_a_cards_own_memory_is_not_held_against_the_machines(tmp_path
 def test_free_memory_is_held_against_the_plan(tmp_path: Path, gib: float, level: Level) -> None:
     write(tmp_path, {"proc/meminfo": f"MemTotal: 16000000 kB\nMemAvailable:   {round(gib * 1024 * 1024)} kB\n"})
     assert memory(PLAN, tmp_path).level is level
-
-
-def test_without_a_plan_memory_is_not_judged(tmp_path: Path) -> None:
-    assert memory(None, tmp_path).level is Level.SKIP
 
 
 @pytest.mark.parametrize(("free", "level"), [(7, Level.OK), (6, Level.FAIL), (0, Level.FAIL)])
@@ -223,12 +199,9 @@ def clock_check(root: Path, year: int, source: str = "arch_sys_counter") -> Chec
     return wall_clock(datetime.datetime(year, 1, 1, tzinfo=UTC), MADE, root)
 
 
-def test_a_wall_clock_before_the_artifacts_is_told_and_harmless(tmp_path: Path) -> None:
-    assert clock_check(tmp_path, 1970).level is Level.WARN
+def test_a_wall_clock_before_the_artifacts_and_a_coarse_monotonic_clock_are_warnings(tmp_path: Path) -> None:
     assert clock_check(tmp_path, 2027).level is Level.OK
-
-
-def test_a_coarse_monotonic_clock_is_told(tmp_path: Path) -> None:
+    assert clock_check(tmp_path, 1970).level is Level.WARN
     assert clock_check(tmp_path, 2027, "jiffies").level is Level.WARN
 
 
@@ -242,16 +215,13 @@ def test_processor_time_is_read_whatever_a_program_is_called(tmp_path: Path) -> 
     assert processor_ticks(tmp_path) == {7: ("a) S 9 (b", 50)}
 
 
-def test_who_else_computes_is_named_and_oneself_is_not() -> None:
+def test_other_programs_that_compute_are_named_and_this_one_is_not() -> None:
     before = {1: ("robot-ui", 0), 2: ("edge-doctor", 0), 3: ("reused", 0)}
     after = {1: ("robot-ui", 70), 2: ("edge-doctor", 100), 3: ("another", 90), 4: ("new", 99)}
     check = busy_programs(before, after, 100, own=2)
     assert check.level is Level.WARN
     assert check.found == "0.70 cores used by others: robot-ui (pid 1) 0.70"
-
-
-def test_a_quiet_machine_is_fine() -> None:
-    assert busy_programs({1: ("a", 0)}, {1: ("a", 10)}, 100, own=2).level is Level.OK
+    assert busy_programs(before, before, 100, own=2).level is Level.OK
 
 
 def test_a_check_that_warns_has_to_say_what_to_do() -> None:
@@ -260,9 +230,9 @@ def test_a_check_that_warns_has_to_say_what_to_do() -> None:
 
 
 def test_only_failures_fail() -> None:
-    told = Check("x", Level.WARN, "found", "expected", "advice")
-    assert not failed([told, skipped("y", "not here")])
-    assert failed([told, Check("z", Level.FAIL, "found", "expected", "advice")])
+    warning = Check("x", Level.WARN, "found", "expected", "advice")
+    assert not failed([warning, skipped("y", "not here")])
+    assert failed([warning, Check("z", Level.FAIL, "found", "expected", "advice")])
 
 
 def test_what_a_check_found_is_shown_as_it_is() -> None:
@@ -270,3 +240,38 @@ def test_what_a_check_found_is_shown_as_it_is() -> None:
     Console(width=100, file=text).print(table([Check("x", Level.FAIL, "[red]found[/]", "expected", "rm [a]")]))
     assert "[red]found[/]" in text.getvalue()
     assert "rm [a]" in text.getvalue()
+
+
+RULES = {"etc/tic-vla-edge/tic-vla-edge.nft": ""}
+ADDRESS = {"sys/class/net/eth0/address": "02:00:00:00:00:01\n"}
+ROUTE = (
+    "Iface\tDestination\tGateway\tFlags\tRefCnt\tUse\tMetric\tMask\nNAME\t00000000\t017BA8C0\t3\t0\t0\t0\t00000000\n"
+)
+
+
+def test_a_cable_of_its_own_behind_the_firewall_is_good(tmp_path: Path) -> None:
+    write(tmp_path, ADDRESS | RULES | {"proc/net/route": ROUTE.replace("NAME", "wlan0")})
+    assert cable("eth0", tmp_path).level is Level.OK
+
+
+@pytest.mark.parametrize(
+    ("files", "level", "found"),
+    [
+        ({}, Level.FAIL, "no interface eth0"),
+        (ADDRESS | RULES | {"sys/class/net/eth0/master": ""}, Level.FAIL, "part of"),
+        (ADDRESS | RULES | {"sys/class/net/eth0/phy80211/index": "0"}, Level.WARN, "radio"),
+        (ADDRESS | RULES | {"proc/net/route": ROUTE.replace("NAME", "eth0")}, Level.WARN, "default route"),
+        (ADDRESS, Level.WARN, "without /etc/tic-vla-edge/tic-vla-edge.nft"),
+    ],
+    ids=["absent", "bridged", "radio", "routed", "no rules"],
+)
+def test_whatever_lets_others_reach_the_robot_is_found(
+    tmp_path: Path, files: dict[str, str], level: Level, found: str
+) -> None:
+    write(tmp_path, files)
+    check = cable("eth0", tmp_path)
+    assert (check.level, found in check.found) == (level, True)
+
+
+def test_a_simulated_robot_has_no_cable(tmp_path: Path) -> None:
+    assert cable("lo", tmp_path).level is Level.SKIP

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import grp
 import json
-import os
 import shutil
-import stat
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,17 +12,14 @@ from typing import Any
 import pytest
 
 from edge.artifacts.files import seal
-from edge.artifacts.providers import PATTERNS, device_nodes, group_of
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_REFUSED
-from edge.core.device import CUDA, TENSORRT
 from edge.deploy.install import main
 from edge.deploy.install_units import Host, robot_networks, unreadable
-from edge.deploy.service_users import SYSUSERS_FILE
 from edge.deploy.unit_check import UnitVerdict
-from edge.deploy.unit_text import UnitError
+from edge.deploy.unit_text import SYSUSERS_FILE, UnitError
 from edge.deploy.units import BRIDGE_UNIT, FIREWALL_FILE, FIREWALL_UNIT, RUNNER_UNIT, SOCKET
 from edge.signature import keygen
-from export.target.file import load_target
+from export.targets.file import load_target
 from firmware_bridge.core.config import DdsConfig
 from tests.support.processes import REPOSITORY
 
@@ -91,6 +85,12 @@ def test_it_writes_both_units_and_the_user_and_says_how_to_start_them(units: Uni
     ]
     arm = f"sudo {tmp_path}/bin/edge-bridge arm --robot {tmp_path}/go2.toml --socket {SOCKET}"
     assert result["commands"][-1] == arm
+    starts = [index for index, command in enumerate(result["commands"]) if "enable" in command]
+    assert result["commands"].index("sudo systemd-sysusers") < starts[0]
+    assert 'sudo usermod -aG tic-vla-operators "$USER"' in result["commands"]
+    assert FIREWALL_UNIT in result["commands"][starts[0]]
+    text = (tmp_path / "units" / RUNNER_UNIT).read_text()
+    assert "drives after `edge-bridge arm` only" in text and "--arm-at-start" not in text
 
 
 def test_services_of_a_board_follow_its_current_release(units: Units, artifacts_dir: Path, tmp_path: Path) -> None:
@@ -136,24 +136,9 @@ def test_with_consent_it_is_written_and_says_so_but_is_not_started_with_the_mach
     assert "# --arm-at-start was given: " in (tmp_path / "units" / RUNNER_UNIT).read_text()
 
 
-def test_a_runner_that_waits_for_an_operator_says_so_in_its_unit(units: Units, tmp_path: Path) -> None:
-    units()
-    text = (tmp_path / "units" / RUNNER_UNIT).read_text()
-    assert "drives after `edge-bridge arm` only" in text and "--arm-at-start" not in text
-
-
 def test_consent_that_the_robot_file_makes_useless_is_said(units: Units, capsys: pytest.CaptureFixture[str]) -> None:
     assert units("--arm-at-start")[0] == EXIT_DONE
     assert "--arm-at-start changes nothing" in capsys.readouterr().err
-
-
-def test_the_users_are_made_before_anything_starts(units: Units) -> None:
-    _, result = units()
-    assert result is not None
-    starts = [index for index, command in enumerate(result["commands"]) if "enable" in command]
-    assert result["commands"].index("sudo systemd-sysusers") < starts[0]
-    assert 'sudo usermod -aG tic-vla-operators "$USER"' in result["commands"]
-    assert FIREWALL_UNIT in result["commands"][starts[0]]
 
 
 def test_names_of_users_and_group_can_be_given(units: Units, tmp_path: Path) -> None:
@@ -233,13 +218,10 @@ def test_a_file_that_differs_is_replaced_only_by_force(
     assert not (tmp_path / "units" / BRIDGE_UNIT).exists(), "nothing is written when one file is in the way"
     assert units("--force", text="turn left")[0] == EXIT_DONE
     assert (tmp_path / "units" / RUNNER_UNIT).read_text() != before
-
-
-def test_a_link_is_never_written_through(units: Units, tmp_path: Path) -> None:
-    (tmp_path / "units").mkdir()
+    (tmp_path / "units" / BRIDGE_UNIT).unlink()
     (tmp_path / "units" / BRIDGE_UNIT).symlink_to(tmp_path / "elsewhere")
     assert units("--force")[0] == EXIT_BAD_INPUT
-    assert not (tmp_path / "elsewhere").exists()
+    assert not (tmp_path / "elsewhere").exists(), "a link is never written through"
 
 
 @pytest.mark.parametrize(
@@ -291,12 +273,10 @@ def orin_dir(artifacts_dir: Path, tmp_path: Path) -> Path:
 
 
 def jetson(host: Host) -> Host:
-    nodes = host.root / "dev"
-    (nodes / "nvgpu" / "igpu0").mkdir(parents=True)
-    for name in ("nvmap", "nvhost-ctrl", "nvgpu/igpu0/as", "sda", "host1x-fence", "dri/renderD128", "dri/card0"):
-        (nodes / name).parent.mkdir(exist_ok=True)
-        (nodes / name).touch()
-        (nodes / name).chmod(0o666)
+    names = ("nvmap", "nvhost-ctrl", "nvgpu/igpu0/as", "sda", "host1x-fence", "dri/renderD128", "dri/card0")
+    make_nodes(host.root, names)
+    for name in names:
+        (host.root / "dev" / name).chmod(0o666)
     return host
 
 
@@ -324,48 +304,10 @@ def test_a_runner_without_its_device_is_written_to_be_looked_at_but_not_installe
     assert units("--system", artifacts=orin_dir)[0] == EXIT_REFUSED
 
 
-def test_a_node_that_not_everybody_may_open_brings_its_group(tmp_path: Path) -> None:
-    (tmp_path / "dev").mkdir()
-    (tmp_path / "dev" / "nvmap").touch()
-    (tmp_path / "dev" / "nvmap").chmod(0o660)
-    if os.geteuid() == 0:
-        os.chown(tmp_path / "dev" / "nvmap", -1, max(entry.gr_gid for entry in grp.getgrall()))
-    (node,) = device_nodes((CUDA,), tmp_path)
-    assert node.path == Path("/dev/nvmap")
-    assert node.group == grp.getgrgid((tmp_path / "dev" / "nvmap").stat().st_gid).gr_name
-
-
-def test_a_node_of_the_root_group_does_not_put_the_runner_into_that_group() -> None:
-    assert group_of(os.stat_result((stat.S_IFCHR | 0o660, 0, 0, 1, 0, 0, 0, 0, 0, 0))) is None
-
-
-TRACED_CUDA_OPENS = (
-    *("nvmap", "host1x-fence", "dri/renderD128", "dri/renderD129", "nvsciipc", "nvidia0", "nvidiactl"),
-    *(f"nvgpu/igpu0/{name}" for name in ("as", "channel", "ctrl", "ctxsw", "nvsched", "power", "prof", "sched", "tsg")),
-    *(f"nvhost-{name}-gpu" for name in ("as", "ctrl", "ctxsw", "nvsched", "power", "prof", "sched", "tsg")),
-)
-"""Nodes that public traces of CUDA on an Orin name; not tried on a board by this project."""
-
-
-@pytest.mark.parametrize("provider", [CUDA, TENSORRT])
-@pytest.mark.parametrize("name", TRACED_CUDA_OPENS)
-def test_a_node_that_cuda_opens_on_an_orin_is_let_through(tmp_path: Path, provider: str, name: str) -> None:
-    node = tmp_path / "dev" / name
-    node.parent.mkdir(parents=True)
-    node.touch()
-    assert [found.path for found in device_nodes((provider,), tmp_path)] == [Path("/dev") / name]
-
-
-def test_every_pattern_of_device_nodes_names_its_source() -> None:
-    assert all(pattern.source for patterns in PATTERNS.values() for pattern in patterns)
-
-
-@pytest.mark.parametrize("name", ["dri/card0", "sda", "video0", "mem", "nvme0n1"])
-def test_other_nodes_stay_closed(tmp_path: Path, name: str) -> None:
-    node = tmp_path / "dev" / name
-    node.parent.mkdir(parents=True)
-    node.touch()
-    assert device_nodes((CUDA, TENSORRT), tmp_path) == []
+def make_nodes(root: Path, names: Sequence[str]) -> None:
+    for name in names:
+        (root / "dev" / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / "dev" / name).touch()
 
 
 def test_what_the_services_user_could_not_read_is_named(tmp_path: Path) -> None:
@@ -390,25 +332,29 @@ def test_the_way_to_a_file_counts_where_the_services_see_it(tmp_path: Path, monk
     assert tmp_path / "closed" in unreadable([robot])
 
 
-def test_a_processor_has_no_node(tmp_path: Path) -> None:
-    assert device_nodes(("CPUExecutionProvider",), tmp_path) == []
-
-
 def networks(dds: DdsConfig, *given: str) -> list[str]:
     return [str(network) for network in robot_networks(dds, given, lambda: ADDRESSES)]
 
 
-def test_the_robots_network_is_that_of_its_interface() -> None:
-    assert networks(DdsConfig(0, "eth0")) == ["192.168.123.0/24"]
-    assert networks(DdsConfig(0, "lo", ("127.0.0.1",))) == ["127.0.0.0/8"]
-
-
-def test_a_peer_outside_of_it_is_let_through_too() -> None:
-    assert networks(DdsConfig(0, "eth0", ("10.0.0.7",))) == ["10.0.0.7/32", "192.168.123.0/24"]
-
-
-def test_a_network_that_is_given_replaces_what_was_found() -> None:
-    assert networks(DdsConfig(0, "wlan0", ("robot.local",)), "10.1.0.0/30") == ["10.1.0.0/30"]
+@pytest.mark.parametrize(
+    ("dds", "given", "expected"),
+    [
+        (DdsConfig(0, "eth0"), (), ["192.168.123.0/24"]),
+        (DdsConfig(0, "lo", ("127.0.0.1",)), (), ["127.0.0.0/8"]),
+        (DdsConfig(0, "eth0", ("10.0.0.7",)), (), ["10.0.0.7/32", "192.168.123.0/24"]),
+        (DdsConfig(0, "wlan0", ("robot.local",)), ("10.1.0.0/30",), ["10.1.0.0/30"]),
+        (DdsConfig(0, "eth0"), ("127.0.0.0/8",), ["127.0.0.0/8"]),
+    ],
+    ids=[
+        "its interface's",
+        "loopback",
+        "and a peer outside of it",
+        "the given one instead",
+        "a wide one within the host",
+    ],
+)
+def test_the_robots_network_is(dds: DdsConfig, given: tuple[str, ...], expected: list[str]) -> None:
+    assert networks(dds, *given) == expected
 
 
 @pytest.mark.parametrize("network", ["0.0.0.0/0", "0.0.0.0/1", "192.0.0.0/8", "10.0.0.0/15", "::/0", "fe80::/64"])
@@ -419,15 +365,6 @@ def test_a_network_that_would_let_everything_through_is_refused_in_one_line(
     error = capsys.readouterr().err
     assert f"--network {network}: " in error and "expected" in error and error.count("\n") == 1
     assert not (tmp_path / "units").exists()
-
-
-def test_a_wide_network_of_the_robot_files_interface_has_to_be_narrowed() -> None:
-    with pytest.raises(UnitError, match=r"eth0.*10\.0\.0\.0/8.*--network"):
-        robot_networks(DdsConfig(0, "eth0"), (), lambda: {"eth0": [("10.1.2.3", "255.0.0.0")]})
-
-
-def test_the_loopback_network_never_leaves_the_machine_and_may_be_wide() -> None:
-    assert networks(DdsConfig(0, "eth0"), "127.0.0.0/8") == ["127.0.0.0/8"]
 
 
 def test_artifacts_whose_runner_would_run_before_the_bridge_are_refused(
@@ -452,3 +389,5 @@ def test_artifacts_whose_runner_would_run_before_the_bridge_are_refused(
 def test_a_network_that_is_not_known_is_asked_for(dds: DdsConfig, given: tuple[str, ...]) -> None:
     with pytest.raises(UnitError, match="--network"):
         networks(dds, *given)
+    with pytest.raises(UnitError, match=r"eth0.*10\.0\.0\.0/8.*--network"):
+        robot_networks(DdsConfig(0, "eth0"), (), lambda: {"eth0": [("10.1.2.3", "255.0.0.0")]})

@@ -32,12 +32,9 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_what_fits_stays(folder: Path) -> None:
+def test_what_fits_stays_and_else_the_oldest_runs_are_deleted_as_a_whole(folder: Path) -> None:
     assert clean(folder, 500) == ([], 500)
     assert len(names(folder)) == 10
-
-
-def test_the_oldest_runs_are_deleted_as_a_whole_until_the_rest_fits(folder: Path) -> None:
     deleted, left = clean(folder, 350)
     assert {path.name for path in deleted} == {f"flight-{n}{p}.mcap" for n in (0, 1) for p in ("", ".002")}
     assert left == 300

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import json
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 
 from edge.core.geometry import SE2
 from edge.flightlog.part import encode
-from edge.flightlog.recorder import Recorder
 from edge.flightlog.records import Throttle, battery_record, odometry_record
 from edge.flightlog.schemas import SCHEMAS, Schema
 from edge.odometry.drift_rate import DriftRate
-from firmware_bridge.unitree.messages.state import BatteryState, RobotState
+from firmware_bridge.core.robot_state import BatteryState, RobotState
 from tests.support.runner import synthetic_run
 
 _TYPES: dict[str, tuple[type, ...]] = {
@@ -89,7 +86,7 @@ SAMPLES: dict[str, dict[str, Any]] = {
 
 
 def complaints(value: Any, schema: Schema, where: str = "") -> list[str]:
-    """What JSON Schema would say, for the keywords that our schemas use; a property without a schema is one too."""
+    """Violations of a schema, for the keywords that ours use; a property without a schema is one too."""
     kinds = schema.get("type", list(_TYPES))
     wanted = [kinds] if isinstance(kinds, str) else kinds
     fits = any(
@@ -117,36 +114,9 @@ def complaints(value: Any, schema: Schema, where: str = "") -> list[str]:
 def test_a_record_of_every_topic_conforms(topic: str) -> None:
     payload: Any = synthetic_run.jpeg(1.0) if topic == "/camera" else SAMPLES[topic]
     assert complaints(json.loads(encode(payload, 7)), SCHEMAS[topic]) == []
-
-
-@pytest.mark.parametrize(
-    ("change", "complaint"),
-    [({"budget_w": "25 W"}, "budget_w"), ({"rails": [1.0]}, "rails"), ({"watts": 3}, "unknown")],
-)
-def test_the_check_itself_finds_what_is_wrong(change: dict[str, Any], complaint: str) -> None:
-    found = complaints({**SAMPLES["/power"], **change}, SCHEMAS["/power"])
-    assert len(found) == 1 and complaint in found[0]
-
-
-def test_schemas_travel_in_the_file(tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path / "flight.mcap")
-    for topic, sample in SAMPLES.items():
-        recorder.put(topic, 1, sample)
-    assert recorder.close() and recorder.dropped == {}
-    with (tmp_path / "flight.mcap").open("rb") as stream:
-        found = {
-            channel.topic: (json.loads(schema.data), json.loads(message.data))
-            for schema, channel, message in make_reader(stream).iter_messages()
-        }
-    assert set(found) == set(SAMPLES)
-    for topic, (schema, payload) in found.items():
-        assert schema == SCHEMAS[topic]
-        assert complaints(payload, schema) == []
-
-
-def test_before_anything_was_fused_the_odometry_record_conforms_too() -> None:
-    record = odometry_record(STATE, None, None, None, None)
-    assert complaints(json.loads(encode(record, 7)), SCHEMAS["/odometry"]) == []
+    if topic == "/odometry":
+        unfused = odometry_record(STATE, None, None, None, None)
+        assert complaints(json.loads(encode(unfused, 7)), SCHEMAS[topic]) == []
 
 
 @pytest.mark.parametrize(("source_hz", "passed"), [(500, 50), (51, 50), (50, 50), (20, 20)])

@@ -32,7 +32,7 @@ from edge.inference.engines import (
 )
 from edge.inference.graph import GraphError
 from edge.run.command import main as run
-from export.target.file import load_target
+from export.targets.file import load_target
 from tests.support.artifact_directory import edit_manifest
 
 NEEDING = ("vision_encoder", "semantic_context", "action_expert")

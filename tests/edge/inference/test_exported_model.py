@@ -15,7 +15,7 @@ from edge.inference.graph import Graph
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
 from edge.state.ring import EncodedFrame
-from export.evaluation.gate_run import gate_provider
+from export.evaluation.gates import gate_provider
 from export.model.config import PRESETS
 from export.model.network import build
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-import tracemalloc
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -13,9 +12,7 @@ import pytest
 
 from edge.flightlog.schemas import SCHEMAS
 from edge.power.governor.governor import Governor, GovernorConfig, GovernorInputs, GovernorOutputs
-from edge.power.governor.statistics import PowerStatistics
-from edge.power.meters.meter import MeterError, PowerSample
-from edge.power.meters.modelled import ModelledMeter
+from edge.power.meters.meter import MeterError, ModelledMeter, PowerSample
 from edge.power.meters.thermal import ThermalReader, ThermalState
 from edge.power.monitor import Activity, PowerMonitor
 from edge.safety.faults.findings import FindingQueue
@@ -138,13 +135,23 @@ def test_figures_of_a_model_are_never_called_measured() -> None:
     assert statistics["mean"] == pytest.approx(4.6)
 
 
-def test_a_callback_that_fails_does_not_end_the_thread_but_reasoning_and_is_said_once() -> None:
-    said: list[str] = []
+def fail(*_: object) -> None:
+    raise RuntimeError("no room")
 
-    def fail(*_: object) -> None:
+
+class BrokenGovernor(Governor):
+    def step(self, inputs: GovernorInputs, now_ns: int) -> GovernorOutputs:
         raise RuntimeError("no room")
 
-    running = monitor(steady(), on_sample=fail, say=said.append)
+
+@pytest.mark.parametrize(
+    "options",
+    [{"on_sample": fail}, {"governor": BrokenGovernor(GovernorConfig(25.0, 48))}],
+    ids=["callback", "governor"],
+)
+def test_a_failure_does_not_end_the_thread_but_reasoning_and_is_reported_once(options: dict[str, Any]) -> None:
+    lines: list[str] = []
+    running = monitor(steady(), say=lines.append, **options)
     running.start()
     try:
         assert until(lambda: not running.budget().allowed)
@@ -152,40 +159,7 @@ def test_a_callback_that_fails_does_not_end_the_thread_but_reasoning_and_is_said
         assert until(lambda: running.snapshot().stamp_ns > first_ns)
     finally:
         running.close()
-    assert sum("no room" in line for line in said) == 1
-
-
-def test_a_governor_that_fails_leaves_reasoning_off() -> None:
-    class Broken(Governor):
-        def step(self, inputs: GovernorInputs, now_ns: int) -> GovernorOutputs:
-            raise ZeroDivisionError
-
-    running = monitor(steady(), governor=Broken(GovernorConfig(25.0, 48)))
-    running.start()
-    try:
-        assert until(lambda: not running.budget().allowed)
-    finally:
-        running.close()
-
-
-def test_heat_becomes_a_finding_with_its_numbers_in_the_queue() -> None:
-    class Hot(ThermalReader):
-        def __init__(self) -> None:
-            pass
-
-        def read(self, now_ns: int) -> ThermalState:
-            return ThermalState(now_ns, {"tj-thermal": 103.0}, 103.0, -4.0, 1.5, ("gpu-throttle-alert",))
-
-    queue = FindingQueue()
-    running = monitor(steady(), thermal=Hot(), on_findings=queue.put)
-    running.start()
-    try:
-        assert until(lambda: len(queue) > 1)
-    finally:
-        running.close()
-    found = {finding.name: finding.detail for finding in queue.take()}
-    assert found["thermal-trip"] == "103 °C (gpu-throttle-alert)"
-    assert "thermal-throttle" in found
+    assert sum("no room" in line for line in lines) == 1
 
 
 @dataclass(frozen=True)
@@ -194,8 +168,6 @@ class Charge:
 
     received_ns: int
     soc_percent: float | None = 5.0
-    voltage_v: float | None = None
-    current_a: float | None = None
 
 
 def test_a_charge_of_long_ago_says_nothing_of_now() -> None:
@@ -235,16 +207,29 @@ class Heated:
 HOT = ThermalState(0, {"tj": 102.0}, 102.0, -3.0, 2.5, ("gpu-throttle-alert",))
 
 
+def test_heat_becomes_a_finding_with_its_numbers_in_the_queue() -> None:
+    queue = FindingQueue()
+    running = monitor(steady(), thermal=Heat(HOT), on_findings=queue.put)
+    running.start()
+    try:
+        assert until(lambda: len(queue) > 1)
+    finally:
+        running.close()
+    found = {finding.name: finding.detail for finding in queue.take()}
+    assert found["thermal-trip"] == "102 °C (gpu-throttle-alert)"
+    assert "thermal-throttle" in found
+
+
 def test_a_thermal_source_that_stands_still_clears_neither_throttling_nor_trip_and_that_is_said_once() -> None:
-    said: list[str] = []
-    heated = Heated(HOT, said.append)
+    lines: list[str] = []
+    heated = Heated(HOT, lines.append)
     for second in (1, 5, 60, 120):
         outputs = heated.step(second)
         assert outputs.findings == ("thermal-trip", "thermal-throttle")
         assert not outputs.budget.allowed
         heated.heat.state = None
     assert heated.monitor.snapshot().thermal is None
-    assert sum("temperatures are not read" in line for line in said) == 1
+    assert sum("temperatures are not read" in line for line in lines) == 1
 
 
 def test_a_zone_that_gives_no_value_any_more_keeps_its_last_distance() -> None:
@@ -256,47 +241,3 @@ def test_a_zone_that_gives_no_value_any_more_keeps_its_last_distance() -> None:
     heated.heat.state = ThermalState(0, {}, 60.0, 39.0, 44.5)
     assert heated.step(60).findings == ("thermal-throttle",)
     assert heated.step(71).findings == ()
-
-
-def test_generations_are_counted_from_what_the_program_does_where_it_does_not_count() -> None:
-    states = iter([False, True, True, False, True])
-    seen: list[GovernorInputs] = []
-
-    class Watching(Governor):
-        def step(self, inputs: GovernorInputs, now_ns: int) -> GovernorOutputs:
-            seen.append(inputs)
-            return super().step(inputs, now_ns)
-
-    governor = Watching(GovernorConfig(25.0, 48))
-    running = PowerMonitor(None, governor, activity=lambda: Activity(reasoning=next(states)))
-    for index in range(5):
-        running.step((index + 1) * SECOND)
-    assert [inputs.generations for inputs in seen] == [0, 0, 0, 1, 1]
-    assert [inputs.reasoning_s for inputs in seen] == [0.0, 0.0, 1.0, 2.0, 2.0]
-
-
-def test_statistics_weigh_by_time_and_a_gap_counts_as_one_second() -> None:
-    statistics = PowerStatistics()
-    for stamp_s, power_w in ((0, 10.0), (1, 30.0), (100, 10.0)):
-        statistics.add(stamp_s * SECOND, power_w)
-    assert statistics.mean_w == pytest.approx(20.0)
-
-
-def test_the_percentile_is_not_exceeded_for_that_share_of_the_time() -> None:
-    statistics = PowerStatistics()
-    for index in range(1001):
-        statistics.add(index * SECOND // 10, 30.0 if index % 50 == 0 else 10.0)
-    assert statistics.percentile_w(0.9) == pytest.approx(10.0, abs=0.051)
-    assert statistics.percentile_w(0.99) == pytest.approx(30.0, abs=0.051)
-
-
-def test_memory_of_the_statistics_does_not_grow() -> None:
-    statistics = PowerStatistics()
-    tracemalloc.start()
-    try:
-        for index in range(10_000):
-            statistics.add(index, float(index % 2000))
-        grown_bytes, _ = tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
-    assert grown_bytes < 50_000  # the samples alone would be 560,000

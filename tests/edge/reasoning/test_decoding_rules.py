@@ -23,7 +23,7 @@ from edge.reasoning.decoding_rules import (
 )
 from edge.state.reasoning_text import AHEAD, Plan, Progress, Stop, Turn, TurnBack
 from edge.state.ring import EncodedFrame
-from tools.train.scenes.trace_sentences import plan_metres
+from tools.train.drives.trace_sentences import plan_metres
 
 HERE = SE2(0.0, 0.0, 0.0)
 SIDES = st.sampled_from(["left", "right"])

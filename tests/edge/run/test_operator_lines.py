@@ -14,7 +14,7 @@ CHATTERS = (
     "from edge.run.service import operator_lines\n"
     "lines = operator_lines('edge-run')\n"
     "for number in range(2000):\n"
-    "    lines.say('x' * 200)\n"
+    "    lines.write('x' * 200)\n"
     "lines.close(0.1)\n"
 )
 
@@ -23,7 +23,7 @@ def test_lines_reach_the_descriptor_in_order() -> None:
     reader, writer = os.pipe()
     lines = operator_lines("edge-run", writer)
     for line in ("armed", "it is 70 °C"):
-        lines.say(line)
+        lines.write(line)
     lines.close(5.0)
     os.close(writer)
     with os.fdopen(reader, encoding="utf-8") as text:

@@ -135,7 +135,7 @@ class Rig:
     def _assemble(self, *_args: object, stop: threading.Event, **_named: object) -> Any:
         self.stop_flag = stop
         power = SimpleNamespace(start=lambda: None, close=lambda: None, statistics=dict)
-        supervision = SimpleNamespace(says="", active=(), state=SimpleNamespace(value="ok"))
+        supervision = SimpleNamespace(message="", active=(), state=SimpleNamespace(value="ok"))
         control = SimpleNamespace(run=lambda *_: self.control(), supervision=supervision, ended_by="test")
         reasoning = SimpleNamespace(
             run=lambda: stop.wait(20),
@@ -144,7 +144,7 @@ class Rig:
             generation_ms=SimpleNamespace(quantile=lambda _share: 0.0),
             generations=0,
         )
-        return Loops(power, control, reasoning, SimpleNamespace(in_the_way=lambda: ""))  # type: ignore[arg-type]
+        return Loops(power, control, reasoning, SimpleNamespace(blocking_fault=lambda: ""))  # type: ignore[arg-type]
 
 
 @pytest.fixture

@@ -36,11 +36,6 @@ def test_the_test_that_injects_a_fault_exists(fault: Fault) -> None:
         body = found[0].body
 
 
-@pytest.mark.parametrize("fault", ROWS, ids=lambda fault: fault.name)
-def test_a_name_is_lower_case_with_hyphens(fault: Fault) -> None:
-    assert re.fullmatch(r"[a-z]+(-[a-z]+)*", fault.name)
-
-
 def test_what_is_found_by_the_code_is_in_the_table() -> None:
     found = {
         name
@@ -110,13 +105,13 @@ def test_a_finding_cannot_ask_for_more_than_the_limit(scale: float) -> None:
         {"where": "cloud"},
         {"bound_ms": -1},
         {"speed_scale": 0.5},
-        {"says": "no full stop"},
+        {"message": "no full stop"},
         {"test_id": "somewhere"},
     ],
 )
 def test_a_row_that_cannot_be_true_is_refused(change: dict[str, object]) -> None:
     row: dict[str, object] = {"name": "x", "row": 1, "action": Action.ZERO, "bound_ms": 1, "where": "runner"}
-    row |= {"says": "A.", "advice": "B.", "test_id": "f.py::test_x"}
+    row |= {"message": "A.", "advice": "B.", "test_id": "f.py::test_x"}
     Fault(**row)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="fault x"):
         Fault(**(row | change))  # type: ignore[arg-type]
@@ -132,10 +127,6 @@ def test_every_cause_for_which_the_bridge_stops_is_in_the_table_or_is_no_fault_w
     refused = {"not_standing", "battery_low", "operator"}  # only at arming
     assert set(FAULT_OF_CAUSE) | ours | refused == set(CAUSES)
     assert set(FAULT_OF_CAUSE.values()) <= set(FAULTS)
-
-
-def test_what_latches_is_what_stops() -> None:
-    assert all(fault.latch == (fault.action is Action.STOP) for fault in ROWS)
 
 
 def test_findings_of_other_threads_are_taken_once_in_their_order() -> None:

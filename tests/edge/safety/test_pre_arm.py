@@ -1,4 +1,4 @@
-"""Before arming: what would keep the robot from driving is found, and goes again."""
+"""Before arming: a fault that would keep the robot from driving blocks arming until it has cleared."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.support.runner.control_bench import MS, PERIOD_NS, PX, Bench
 
 
 class Desk:
-    """A robot that stands in front of a working camera, looked at 20 times a second."""
+    """A robot that stands in front of a working camera, checked 20 times a second."""
 
     def __init__(self) -> None:
         self.bench = Bench()
@@ -33,8 +33,8 @@ class Desk:
         )
         self.camera = self.robot = True
 
-    def look(self, seconds: float, *findings: Finding) -> str:
-        """What is in the way after so long; a finding is made at each look."""
+    def run(self, seconds: float, *findings: Finding) -> str:
+        """The blocking fault after so long; each step has `findings`."""
         why = ""
         for turn in range(round(seconds * 20)):
             self.bench.now_ns += 50 * MS
@@ -43,7 +43,7 @@ class Desk:
             if self.camera and turn % 2 == 0:
                 self.bench.look()
             self.bench.findings.put(findings)
-            why = self.pre_arm.in_the_way()
+            why = self.pre_arm.blocking_fault()
         return why
 
 
@@ -53,40 +53,40 @@ def desk() -> Desk:
 
 
 def test_with_pictures_and_poses_it_is_ready(desk: Desk) -> None:
-    assert (desk.look(3), desk.pre_arm.state) == ("", State.READY)
+    assert (desk.run(3), desk.pre_arm.state) == ("", State.READY)
 
 
 def test_without_a_picture_it_is_starting(desk: Desk) -> None:
     desk.camera = False
-    assert "no new picture" in desk.look(1)
+    assert "no new picture" in desk.run(1)
     assert desk.pre_arm.state is State.STARTING
 
 
-def test_a_camera_that_ends_while_an_operator_is_waited_for_is_in_the_way_until_it_is_back(desk: Desk) -> None:
-    desk.look(3600 / 60)
+def test_a_camera_that_ends_while_the_runner_waits_blocks_arming_until_it_is_back(desk: Desk) -> None:
+    desk.run(3600 / 60)
     desk.camera = False
-    assert desk.look(1) != ""
+    assert desk.run(1) != ""
     desk.camera = True
-    assert desk.look(3) == ""
+    assert desk.run(3) == ""
 
 
-def test_a_robot_that_falls_silent_is_in_the_way(desk: Desk) -> None:
-    desk.look(2)
+def test_a_robot_that_falls_silent_blocks_arming(desk: Desk) -> None:
+    desk.run(2)
     desk.robot = False
-    assert "pose is too old" in desk.look(0.5)
+    assert "pose is too old" in desk.run(0.5)
 
 
 def test_a_robot_that_was_carried_may_be_armed_once_it_is_put_down(desk: Desk) -> None:
     desk.bench.attitude.roll_rad = 1.0
-    assert "leans" in desk.look(2)
+    assert "leans" in desk.run(2)
     desk.bench.attitude.roll_rad = 0.0
-    assert "leans" in desk.look(1), "not at once"
-    assert desk.look(2) == ""
+    assert "leans" in desk.run(1), "not at once"
+    assert desk.run(2) == ""
 
 
-def test_a_board_about_to_switch_off_from_heat_is_in_the_way(desk: Desk) -> None:
-    assert "switch itself off" in desk.look(1, Finding("thermal-trip", "104 °C"))
+def test_a_board_about_to_switch_off_from_heat_blocks_arming(desk: Desk) -> None:
+    assert "switch itself off" in desk.run(1, Finding("thermal-trip", "104 °C"))
 
 
 def test_what_only_lowers_the_speed_is_not(desk: Desk) -> None:
-    assert desk.look(2, Finding("battery-low", "15 %")) == ""
+    assert desk.run(2, Finding("battery-low", "15 %")) == ""

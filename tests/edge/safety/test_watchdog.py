@@ -1,4 +1,4 @@
-"""The watchdog is fed by ticks that were on time, and by nothing else."""
+"""Ticks on time feed the watchdog and nothing else does; a reasoning call that hangs is interrupted, then given up."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from edge.run.service import STATUS_PERIOD_NS, ServiceReporter
-from edge.safety.watchdog import NEEDED_ON_TIME, WINDOW_TICKS, WatchdogFeeder
+from edge.safety.watchdog import NEEDED_ON_TIME, WINDOW_TICKS, Hang, ReasoningWatch, WatchdogFeeder
 from firmware_bridge.notify import Notifier
 from tests.support.notify_socket import NotifySocket, notify_socket
 
@@ -26,26 +26,11 @@ def pings(fed: WatchdogFeeder, ticks: list[bool], start: int = 0) -> list[int]:
     return [start + n for n, on_time in enumerate(ticks) if fed.on_tick(on_time, (start + n) * TICK_NS)]
 
 
-def test_the_first_ping_waits_for_a_window_of_ticks() -> None:
-    assert pings(feeder(), [True] * WINDOW_TICKS) == [WINDOW_TICKS - 1]
-
-
-def test_pings_are_never_further_apart_than_their_period() -> None:
-    due = pings(feeder(), [True] * 200)
-    assert {later - earlier for earlier, later in itertools.pairwise(due)} == {PING_NS // TICK_NS - 1}
-
-
 def test_two_late_ticks_in_ten_are_forgiven_and_three_are_not() -> None:
     late = WINDOW_TICKS - NEEDED_ON_TIME
     forgiven, not_forgiven = feeder(), feeder()
     assert pings(forgiven, [True] * NEEDED_ON_TIME + [False] * late)
     assert not pings(not_forgiven, [True] * (NEEDED_ON_TIME - 1) + [False] * (late + 1))
-
-
-def test_a_control_thread_that_stays_late_is_never_fed() -> None:
-    fed = feeder()
-    pings(fed, [True] * WINDOW_TICKS)
-    assert pings(fed, [False] * 100, start=WINDOW_TICKS) == []
 
 
 def test_deadlines_that_were_slept_over_are_ticks_that_were_not_on_time() -> None:
@@ -60,12 +45,6 @@ def test_jitter_below_half_a_period_is_no_missed_tick() -> None:
     for n in range(3 * WINDOW_TICKS):
         fed.on_tick(True, n * TICK_NS + (n % 2) * (TICK_NS // 2 - 1))
     assert fed.healthy
-
-
-def test_health_comes_back_with_ticks_on_time() -> None:
-    fed = feeder()
-    pings(fed, [False] * WINDOW_TICKS)
-    assert pings(fed, [True] * WINDOW_TICKS, start=WINDOW_TICKS)
 
 
 def test_without_a_watchdog_no_ping_is_due() -> None:
@@ -106,12 +85,12 @@ def service(tmp_path: Path) -> Iterator[Service]:
         yield Service(manager)
 
 
-def test_a_long_step_of_start_up_asks_for_time_and_says_what_it_does(service: Service) -> None:
+def test_a_long_step_of_start_up_asks_for_time_and_names_itself(service: Service) -> None:
     service.reporter.starting("verifying artifacts", 60)
     assert service.manager.messages() == [{"EXTEND_TIMEOUT_USEC": "60000000"}, {"STATUS": "verifying artifacts"}]
 
 
-def test_ready_is_said_once_and_only_after_a_window_of_ticks_on_time(service: Service) -> None:
+def test_ready_is_sent_once_and_only_after_a_window_of_ticks_on_time(service: Service) -> None:
     assert service.tick(WINDOW_TICKS - 1) == []
     assert service.tick(1) == [{"READY": "1", "STATUS": "at 9"}]
     assert not any("READY" in message for message in service.tick(100))
@@ -121,14 +100,14 @@ def test_a_runner_that_is_never_on_time_is_never_ready(service: Service) -> None
     assert service.tick(100, on_time=False) == []
 
 
-def test_systemd_hears_the_watchdog_within_its_time_as_long_as_ticks_are_on_time(service: Service) -> None:
+def test_systemd_gets_a_ping_within_its_time_as_long_as_ticks_are_on_time(service: Service) -> None:
     service.tick(WINDOW_TICKS)
-    heard = [n for n in range(100) if {"WATCHDOG": "1"} in service.tick(1)]
-    assert heard[0] * TICK_NS <= PING_NS
-    assert all((later - earlier) * TICK_NS <= PING_NS for earlier, later in itertools.pairwise(heard))
+    pinged = [n for n in range(100) if {"WATCHDOG": "1"} in service.tick(1)]
+    assert pinged[0] * TICK_NS <= PING_NS
+    assert all((later - earlier) * TICK_NS <= PING_NS for earlier, later in itertools.pairwise(pinged))
 
 
-def test_systemd_hears_nothing_of_a_control_thread_that_is_late(service: Service) -> None:
+def test_systemd_gets_no_ping_from_a_control_thread_that_is_late(service: Service) -> None:
     service.tick(2 * WINDOW_TICKS)
     service.tick(WINDOW_TICKS, on_time=False)
     assert {"WATCHDOG": "1"} not in service.tick(100, on_time=False)
@@ -142,9 +121,10 @@ def wait(service: Service, count: int, text: str = "waiting to be armed") -> lis
     return service.manager.messages()
 
 
-def test_a_runner_that_waits_for_an_operator_is_ready_and_says_what_for(service: Service) -> None:
+def test_a_runner_that_waits_for_an_operator_is_ready_and_tells_what_it_waits_for(service: Service) -> None:
     assert wait(service, 1) == [{"READY": "1", "STATUS": "waiting to be armed"}]
     assert not any("READY" in message for message in [*wait(service, 1000), *service.tick(100)])
+    assert {"STATUS": "arming"} in wait(service, 3, "arming")
 
 
 def test_waiting_feeds_the_watchdog_in_time_from_ready_until_ticks_do(service: Service) -> None:
@@ -164,17 +144,75 @@ def test_a_waiting_loop_that_stands_still_feeds_nothing(service: Service) -> Non
     assert service.manager.messages() == []
 
 
-def test_what_is_waited_for_is_said_when_it_changes(service: Service) -> None:
-    wait(service, 1)
-    assert wait(service, 3, "arming") == [{"STATUS": "arming"}]
-
-
 def test_the_status_line_is_renewed_without_flooding(service: Service) -> None:
     service.tick(WINDOW_TICKS)
-    said = [message for message in service.tick(150) if set(message) == {"STATUS"}]
-    assert len(said) == 150 * TICK_NS // STATUS_PERIOD_NS
+    renewed = [message for message in service.tick(150) if set(message) == {"STATUS"}]
+    assert len(renewed) == 150 * TICK_NS // STATUS_PERIOD_NS
 
 
-def test_stopping_is_said(service: Service) -> None:
+def test_the_manager_is_told_of_the_end(service: Service) -> None:
     service.reporter.stopping("asked to stop")
     assert service.manager.messages() == [{"STOPPING": "1", "STATUS": "asked to stop"}]
+
+
+# --- the reasoning thread ---
+
+S = 1_000_000_000
+STEP_NS = S // 20
+
+
+class ReasoningRun:
+    """A watch and a reasoning thread that makes progress when the test says so."""
+
+    def __init__(self, longest_ms: float | None = None) -> None:
+        self.watch = ReasoningWatch()
+        self.longest_ms = longest_ms
+        self.now_ns = self.progress_ns = 100 * S
+        self.found: list[tuple[float, Hang]] = []
+
+    def hang(self, seconds: float) -> ReasoningRun:
+        """The thread is in one call for so long; the watch steps 20 times a second."""
+        for _ in range(round(seconds * S / STEP_NS)):
+            self.now_ns += STEP_NS
+            hang = self.watch.step(self.progress_ns, self.longest_ms, self.now_ns)
+            if hang is not Hang.NONE:
+                self.found.append((round((self.now_ns - self.progress_ns) / S), hang))
+        return self
+
+    def goes_on(self) -> None:
+        self.progress_ns = self.now_ns
+
+
+def test_a_call_that_takes_ten_seconds_is_interrupted_once() -> None:
+    assert ReasoningRun().hang(25).found == [(10, Hang.INTERRUPT)]
+
+
+def test_a_call_that_an_interrupt_does_not_end_is_given_up() -> None:
+    found = ReasoningRun().hang(31).found
+    assert found[:2] == [(10, Hang.INTERRUPT), (30, Hang.GIVE_UP)]
+
+
+def test_after_an_interrupt_that_helped_the_next_hang_is_interrupted_again() -> None:
+    run = ReasoningRun().hang(12)
+    run.goes_on()
+    run.hang(12)
+    assert [hang for _, hang in run.found] == [Hang.INTERRUPT, Hang.INTERRUPT]
+
+
+def test_calls_that_end_are_left_alone_however_many_there_are() -> None:
+    run = ReasoningRun()
+    for _ in range(20):
+        run.hang(9)
+        run.goes_on()
+    assert run.found == []
+
+
+def test_where_generations_take_long_a_call_may_too() -> None:
+    assert ReasoningRun(longest_ms=8_000).hang(23).found == []
+    assert ReasoningRun(longest_ms=8_000).hang(25).found == [(24, Hang.INTERRUPT)]
+
+
+def test_a_process_that_was_frozen_has_not_hung() -> None:
+    run = ReasoningRun().hang(1)
+    run.now_ns += 3600 * S
+    assert run.hang(1).found == []

@@ -15,19 +15,8 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from export.checkpoint import load_checkpoint
-from tests.support.export.internvl import CONFIG, hf_model, original_tensors, refusal, write_directory
-
-
-@pytest.fixture(scope="module")
-def original() -> dict[str, Tensor]:
-    return original_tensors(hf_model())
-
-
-@pytest.fixture
-def vlm(original: dict[str, Tensor], tmp_path: Path) -> Path:
-    """A directory in OpenGVLab's layout."""
-    return write_directory(tmp_path / "vlm", original)
+from export.checkpoint.load import load_checkpoint
+from tests.support.export.internvl import CONFIG, refusal, write_directory
 
 
 def header(fields: object, data: bytes = b"") -> bytes:

@@ -7,12 +7,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from export.checkpoint.coverage import CheckpointError
-from export.checkpoint.shipped import FOLDER, shipped_weights
-from export.model.config import PRESETS
-from export.model.config_file import with_overrides
+from export.checkpoint.load import SHIPPED, shipped_weights
+from export.model.config import PRESETS, with_overrides
 from export.model.network import PARTS, build
-from export.model.weights import WeightsInfo, save_weights
+from export.model.weights import CheckpointError, WeightsInfo, save_weights
 from export.pipeline.job import WeightSource
 
 SMALL = with_overrides(
@@ -48,7 +46,7 @@ def test_a_damaged_file_is_said(folder: Path) -> None:
 
 def test_an_export_takes_them_unless_it_is_told_otherwise(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("export.pipeline.job.shipped_weights", lambda config: shipped_weights(config, folder))
-    shipped, random = WeightSource(SMALL, [], None).get(), WeightSource(SMALL, [], 3).get()
+    shipped, random = WeightSource(SMALL, [], None).loaded, WeightSource(SMALL, [], 3).loaded
     assert shipped.info.trained and not random.info.trained
     trained = build(SMALL, 5).half().float()
     for name, tensor in shipped.model.state_dict().items():
@@ -61,7 +59,7 @@ def test_without_any_an_export_is_of_a_seed(tmp_path: Path, monkeypatch: pytest.
     assert WeightSource(SMALL, [], None).fingerprint()["seed"] == 0
 
 
-@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.safetensors")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.safetensors")), ids=lambda path: path.stem)
 def test_the_weights_that_ship_are_those_of_todays_network_and_small_and_have_a_card(path: Path) -> None:
     assert shipped_weights(PRESETS[path.stem]) == path
     assert path.stat().st_size <= 40_000_000 and path.with_suffix(".md").is_file()

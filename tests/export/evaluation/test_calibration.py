@@ -15,7 +15,6 @@ from export.evaluation.calibration import (
     SETS,
     CalibrationError,
     CalibrationSet,
-    Clip,
     list_calibration_sets,
     load_calibration,
     read_set,
@@ -56,17 +55,6 @@ def test_the_shipped_set_has_three_walks_of_twenty_seconds(shipped: CalibrationS
         assert clip.assumed == ""
 
 
-def test_in_the_shipped_walks_the_robot_walks(shipped: CalibrationSet) -> None:
-    for clip in shipped.clips:
-        moved = clip.frames[0].T_odom_base.inverse() @ clip.frames[-1].T_odom_base
-        assert 2.0 < moved.x_m < 15.0
-        assert len({frame.image.tobytes() for frame in clip.frames}) == len(clip.frames)
-
-
-def test_the_shipped_set_is_small_enough_for_a_repository() -> None:
-    assert sum(path.stat().st_size for path in (SETS / "corridor-go2").iterdir()) <= 700_000
-
-
 def test_the_shipped_frames_are_what_the_simulator_shows(shipped: CalibrationSet) -> None:
     walk = WALKS[0]
     for shown, kept in zip(record(walk, duration_s=2.0), shipped.clips[0].frames[:3], strict=True):
@@ -81,18 +69,16 @@ def test_an_unknown_name_lists_the_names_there_are() -> None:
     assert list_calibration_sets() == ["corridor-go2"]
 
 
-def _changed_picture(copy: Path) -> None:
-    path = copy / "vending-03.jpg"
-    path.write_bytes(path.read_bytes() + b"\0")
+def edited(name: str, before: bytes, after: bytes) -> Callable[[Path], object]:
+    """Replace bytes of one file of a set."""
+    return lambda copy: (copy / name).write_bytes((copy / name).read_bytes().replace(before, after, 1))
 
 
-def _changed_text(copy: Path) -> None:
-    path = copy / "set.toml"
-    path.write_text(path.read_text().replace("walk down the corridor", "walk up the corridor"))
+CHANGES = [edited("vending-03.jpg", b"\xff\xd9", b"\xff\xd9\0"), edited("set.toml", b"down", b"up")]
 
 
-@pytest.mark.parametrize("change", [_changed_picture, _changed_text])
-def test_the_hash_covers_every_file(shipped: CalibrationSet, tmp_path: Path, change: Callable[[Path], None]) -> None:
+@pytest.mark.parametrize("change", CHANGES)
+def test_the_hash_covers_every_file(shipped: CalibrationSet, tmp_path: Path, change: Callable[[Path], object]) -> None:
     copy = tmp_path / "corridor-go2"
     shutil.copytree(SETS / "corridor-go2", copy)
     assert read_set(copy).sha256 == shipped.sha256
@@ -100,44 +86,18 @@ def test_the_hash_covers_every_file(shipped: CalibrationSet, tmp_path: Path, cha
     assert read_set(copy).sha256 != shipped.sha256
 
 
-def _missing(copy: Path) -> None:
-    (copy / "vending-03.jpg").unlink()
-
-
-def _extra(copy: Path) -> None:
-    (copy / "other.jpg").write_bytes(b"")
-
-
-def _not_an_image(copy: Path) -> None:
-    (copy / "vending-03.jpg").write_bytes(b"not an image")
-
-
-def _unknown_key(copy: Path) -> None:
-    (copy / "set.toml").write_text("colour = 1\n" + (copy / "set.toml").read_text())
-
-
-def _infinite(copy: Path) -> None:
-    text = (copy / "set.toml").read_text()
-    (copy / "set.toml").write_text(text.replace("pose = [0.009,", "pose = [inf,"))
-
-
-def _gap(copy: Path) -> None:
-    text = (copy / "set.toml").read_text()
-    (copy / "set.toml").write_text(text.replace("stamp_s = 3.0", "stamp_s = 1.5"))
-
-
 @pytest.mark.parametrize(
     ("change", "line"),
     [
-        (_missing, "vending-03.jpg is missing"),
-        (_extra, "files that set.toml does not list: other.jpg"),
-        (_not_an_image, "vending-03.jpg is not a readable image"),
-        (_unknown_key, r"unknown keys \['colour'\]"),
-        (_infinite, "must be finite"),
-        (_gap, "apart, expected about 1 s"),
+        (lambda copy: (copy / "vending-03.jpg").unlink(), "vending-03.jpg is missing"),
+        (lambda copy: (copy / "other.jpg").write_bytes(b""), "files that set.toml does not list: other.jpg"),
+        (lambda copy: (copy / "vending-03.jpg").write_bytes(b"not an image"), "vending-03.jpg is not a readable image"),
+        (edited("set.toml", b"schema", b"colour = 1\nschema"), "unknown key 'colour'"),
+        (edited("set.toml", b"pose = [0.009,", b"pose = [inf,"), "expected a finite number, found inf"),
+        (edited("set.toml", b"stamp_s = 3.0", b"stamp_s = 1.5"), "apart, expected about 1 s"),
     ],
 )
-def test_a_damaged_set_is_refused_in_one_line(tmp_path: Path, change: Callable[[Path], None], line: str) -> None:
+def test_a_damaged_set_is_refused_in_one_line(tmp_path: Path, change: Callable[[Path], object], line: str) -> None:
     copy = tmp_path / "corridor-go2"
     shutil.copytree(SETS / "corridor-go2", copy)
     change(copy)
@@ -176,12 +136,6 @@ def test_the_hash_of_a_folder_is_that_of_its_images(tmp_path: Path) -> None:
     assert load_calibration(f"folder:{folder}").sha256 != before
 
 
-def test_large_images_are_made_smaller(tmp_path: Path) -> None:
-    folder = _folder(tmp_path / "mine")
-    cv2.imwrite(str(folder / "000.png"), _picture(0, 1920, 1080))
-    assert load_calibration(f"folder:{folder}").clips[0].frames[0].image.shape == (540, 960, 3)
-
-
 def test_a_video_gives_one_picture_a_second(tmp_path: Path) -> None:
     (clip,) = load_calibration(f"video:{_video(tmp_path / 'walk.avi', 25)}").clips
     assert len(clip.frames) == 21 and "0.5 m/s" in clip.assumed
@@ -214,8 +168,3 @@ def test_an_unreadable_image_in_a_folder_is_named(tmp_path: Path) -> None:
     (folder / "005.png").write_bytes(b"\x89PNG")
     with pytest.raises(CalibrationError, match=r"005\.png is not a readable image"):
         load_calibration(f"folder:{folder}")
-
-
-def test_a_clip_that_is_too_short_cannot_be_made(shipped: CalibrationSet) -> None:
-    with pytest.raises(CalibrationError, match=r"clip x: 9\.0 s long"):
-        Clip("x", "walk", shipped.clips[0].frames[:10])

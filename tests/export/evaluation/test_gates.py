@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 
-from export.evaluation.gates import GateError, GateResult, TaskResult, Verdict, judge, require, worst
-from export.evaluation.metrics import Arrays, ParityError, ParityResult, Sample, compare
-from export.target.sections import GraphGate, TaskGate
+from export.evaluation.gates import GateError, GateResult, Verdict, judge, require
+from export.evaluation.parity import Arrays, ParityError, ParityResult, Sample, compare
+from export.evaluation.task_error import TaskResult
+from export.targets.sections import GraphGate, TaskGate
 
 GATE = GraphGate(inputs=2, min_cosine=0.99, max_abs=0.1, min_difference=1e-3, warn_cosine=0.999, top1=0.9)
 TASK_GATE = TaskGate(
@@ -45,23 +46,6 @@ def test_the_same_outputs_are_exactly_the_same() -> None:
     assert found.min_difference > 0
 
 
-def test_the_worst_input_counts() -> None:
-    worst_one = samples()[1].feeds["x"]
-
-    def run(feeds: Arrays) -> Arrays:
-        return {"visual_tokens": 2 * feeds["x"] + (0.5 if np.array_equal(feeds["x"], worst_one) else 0)}
-
-    assert compare("vision_encoder", samples(), run).max_abs == pytest.approx(0.5)
-
-
-def test_outputs_that_point_elsewhere_have_a_low_cosine() -> None:
-    assert compare("vision_encoder", samples(), lambda f: {"visual_tokens": -f["x"]}).cosine == -1.0
-
-
-def test_a_graph_that_gives_the_same_for_every_input_shows_no_difference() -> None:
-    assert compare("vision_encoder", samples(), lambda _: {"visual_tokens": np.ones((1, 4))}).min_difference == 0.0
-
-
 def test_the_share_of_equal_tokens_is_counted_over_all_inputs() -> None:
     expected = [tokens([[0, 1]]), tokens([[1, 0]]), tokens([[0, 3]]), tokens([[5, 0]])]
     answers = iter([[[0.0, 2.0]], [[1.0, 0.1]], [[9.0, 3.0]], [[5.0, 0.0]]])
@@ -76,7 +60,7 @@ def test_a_chosen_token_alone_counts_too() -> None:
 
 
 @pytest.mark.parametrize(
-    ("answer", "said"),
+    ("answer", "message"),
     [
         ({}, "gives no 'visual_tokens'"),
         ({"visual_tokens": np.zeros((1, 5))}, r"visual_tokens is \[1, 5\], PyTorch gives \[1, 4\]"),
@@ -84,8 +68,8 @@ def test_a_chosen_token_alone_counts_too() -> None:
         ({"visual_tokens": np.full((1, 4), np.inf)}, "not finite"),
     ],
 )
-def test_outputs_that_cannot_be_compared_are_named(answer: Arrays, said: str) -> None:
-    with pytest.raises(ParityError, match=f"vision_encoder: .*{said}"):
+def test_outputs_that_cannot_be_compared_are_named(answer: Arrays, message: str) -> None:
+    with pytest.raises(ParityError, match=f"vision_encoder: .*{message}"):
         compare("vision_encoder", samples(), lambda _: answer)
 
 
@@ -97,22 +81,8 @@ def test_one_input_is_not_enough_for_the_negative_control() -> None:
 # ---- what it is held to
 
 
-def test_numbers_within_every_threshold_pass() -> None:
-    assert judge(GOOD, STEADY, GATE, TASK_GATE) == Verdict("PASS")
-
-
-def test_a_threshold_itself_still_passes() -> None:
-    edge = ParityResult(inputs=2, cosine=0.999, max_abs=0.1, min_difference=1e-3, top1=0.9)
-    assert (
-        judge(
-            edge, replace(STEADY, waypoint_cm=2, heading_deg=1, speed_mps=0.05, turn_radps=0.1), GATE, TASK_GATE
-        ).level
-        == "PASS"
-    )
-
-
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"cosine": 0.98}, "cosine 0.98 (≥ 0.99)"),
         ({"max_abs": 0.2}, "max-abs 0.2 (≤ 0.1)"),
@@ -122,10 +92,10 @@ def test_a_threshold_itself_still_passes() -> None:
         ({"max_abs": float("nan")}, "max-abs nan (≤ 0.1)"),
     ],
 )
-def test_every_tensor_threshold_fails_alone(change: dict[str, float], said: str) -> None:
+def test_every_tensor_threshold_fails_alone(change: dict[str, float], message: str) -> None:
     verdict = judge(replace(GOOD, **change), STEADY, GATE, TASK_GATE)
     assert verdict.level == "FAIL"
-    assert said in verdict.reasons
+    assert message in verdict.reasons
 
 
 def test_a_model_that_ignores_its_input_fails_though_its_graph_is_exactly_that_model() -> None:
@@ -136,7 +106,7 @@ def test_a_model_that_ignores_its_input_fails_though_its_graph_is_exactly_that_m
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"waypoint_cm": 6}, "waypoint error in cm 6 (≤ 5)"),
         ({"heading_deg": 3}, "heading error in deg 3 (≤ 2)"),
@@ -149,13 +119,13 @@ def test_a_model_that_ignores_its_input_fails_though_its_graph_is_exactly_that_m
         ({"token_agreement": 0.0}, "share of the same text 0 (≥ 0.1)"),
     ],
 )
-def test_every_task_threshold_fails_alone(change: dict[str, float], said: str) -> None:
+def test_every_task_threshold_fails_alone(change: dict[str, float], message: str) -> None:
     verdict = judge(GOOD, replace(STEADY, **change), GATE, TASK_GATE)
-    assert verdict == Verdict("FAIL", (said,))
+    assert verdict == Verdict("FAIL", (message,))
 
 
 @pytest.mark.parametrize(
-    ("parity", "task", "said"),
+    ("parity", "task", "message"),
     [
         (replace(GOOD, cosine=0.995), STEADY, "cosine 0.995 (≥ 0.999)"),
         (GOOD, replace(STEADY, waypoint_cm=3), "waypoint error in cm 3 (≤ 2)"),
@@ -165,12 +135,8 @@ def test_every_task_threshold_fails_alone(change: dict[str, float], said: str) -
         (GOOD, replace(STEADY, token_agreement=0.3), "share of the same text 0.3 (≥ 0.5)"),
     ],
 )
-def test_between_two_thresholds_it_warns_and_says_why(parity: ParityResult, task: TaskResult, said: str) -> None:
-    assert judge(parity, task, GATE, TASK_GATE) == Verdict("WARN", (said,))
-
-
-def test_a_failure_is_not_softened_by_a_warning() -> None:
-    assert judge(replace(GOOD, cosine=0.5), replace(STEADY, waypoint_cm=3), GATE, TASK_GATE).level == "FAIL"
+def test_between_two_thresholds_it_warns_and_says_why(parity: ParityResult, task: TaskResult, message: str) -> None:
+    assert judge(parity, task, GATE, TASK_GATE) == Verdict("WARN", (message,))
 
 
 def test_another_token_from_untrained_weights_only_warns() -> None:
@@ -193,10 +159,6 @@ def test_plans_that_do_not_follow_the_semantic_state_warn_that_the_task_cannot_t
     assert "hardly follow the semantic state" in verdict.reasons[0]
 
 
-def test_a_graph_without_tokens_or_task_is_held_to_the_rest() -> None:
-    assert judge(replace(GOOD, top1=None), None, GATE, TASK_GATE) == Verdict("PASS")
-
-
 def test_thresholds_that_a_target_does_not_give_do_not_judge() -> None:
     gate = replace(GATE, warn_cosine=None, top1=None)
     assert judge(replace(GOOD, cosine=0.991, top1=0.0), None, gate, TASK_GATE) == Verdict("PASS")
@@ -205,14 +167,6 @@ def test_thresholds_that_a_target_does_not_give_do_not_judge() -> None:
 def test_a_failed_graph_is_refused_with_one_line_that_gives_the_numbers() -> None:
     with pytest.raises(GateError, match=r"^action_expert: not the same model: cosine 0.5 [^;]*$"):
         require("action_expert", judge(replace(GOOD, cosine=0.5), None, GATE, TASK_GATE))
-
-
-def test_a_warning_is_not_refused() -> None:
-    require("action_expert", Verdict("WARN", ("cosine",)))
-
-
-def test_the_worst_verdict_speaks_for_all() -> None:
-    assert worst({"a": Verdict("PASS"), "b": Verdict("WARN"), "c": Verdict("PASS")}) == "WARN"
 
 
 @pytest.mark.parametrize(
@@ -227,4 +181,4 @@ def test_a_gate_on_another_provider_than_the_one_that_ships_is_recorded_as_such(
 
 
 def test_a_task_result_survives_json() -> None:
-    assert TaskResult.from_dict(json.loads(json.dumps(STEADY.to_dict()))) == STEADY
+    assert TaskResult.from_dict(json.loads(json.dumps(asdict(STEADY)))) == STEADY

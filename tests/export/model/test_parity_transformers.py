@@ -10,7 +10,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from export.checkpoint import config_from_hf, load_checkpoint
+from export.checkpoint.hf_config import read_hf_config
+from export.checkpoint.load import load_checkpoint
+from export.model.config import PRESETS, LanguageConfig
 from export.model.network import TicVla
 from tests.support.export.internvl import CONFIG, hf_model, original_tensors, write_directory
 
@@ -119,14 +121,13 @@ def test_greedy_text_is_the_same(pair: tuple[Any, TicVla], frames: Tensor, ids: 
     assert len(set(text)) > 3
 
 
-def test_the_directory_tells_its_own_numbers(tmp_path: Path) -> None:
+def test_a_directory_gives_its_own_numbers(tmp_path: Path) -> None:
     """Both config.json layouts, at the size of the paper."""
     from transformers import InternVLConfig
-
-    from export.model.config import PRESETS
 
     vision = {"attention_bias": True, "use_absolute_position_embeddings": True}
     text = {"model_type": "qwen2", "hidden_size": 896, "num_hidden_layers": 24, "num_attention_heads": 14}
     text |= {"num_key_value_heads": 2, "intermediate_size": 4864, "vocab_size": 151674, "rope_theta": 1e6}
     InternVLConfig(vision_config=vision, text_config=text).save_pretrained(tmp_path)
-    assert config_from_hf(tmp_path) == (PRESETS["1b"].vision, PRESETS["1b"].language)
+    found = read_hf_config(tmp_path, LanguageConfig())
+    assert (found.vision, found.language) == (PRESETS["1b"].vision, PRESETS["1b"].language)

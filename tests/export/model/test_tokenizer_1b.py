@@ -43,25 +43,16 @@ def test_text_is_cut_as_by_tiktoken(tokenizer: Tokenizer) -> None:
     ("token", "number"),
     [
         ("<|endoftext|>", 151643),
-        ("<|im_start|>", 151644),
         ("<|im_end|>", 151645),
-        ("<|vision_start|>", 151652),
         ("<tool_call>", 151657),
-        ("<|file_sep|>", 151664),
         ("<img>", 151665),
-        ("</img>", 151666),
         ("<IMG_CONTEXT>", 151667),
-        ("<quad>", 151668),
         ("</box>", 151673),
     ],
 )
 def test_added_tokens_have_the_ids_of_internvl3(tokenizer: Tokenizer, token: str, number: int) -> None:
-    assert tokenizer.token_to_id(token) == number
+    assert (tokenizer.token_to_id(token), tokenizer.get_vocab_size()) == (number, 151674)
     assert tokenizer.encode(f"a{token}b", add_special_tokens=False).ids[1] == number
-
-
-def test_the_vocabulary_ends_where_the_network_does(tokenizer: Tokenizer) -> None:
-    assert tokenizer.get_vocab_size() == 151674
 
 
 def test_another_vocabulary_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

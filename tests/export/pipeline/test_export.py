@@ -5,27 +5,27 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import onnx
 import pytest
 import torch
 
-from edge.artifacts.manifest import Artifacts, load_artifacts
-from export.cli import DEFAULT_CALIBRATION, main
+from edge.artifacts.manifest import Artifacts
+from edge.inference.language import Generation, LanguageModel
+from edge.reasoning.prompt import Segment
+from export.cli import main
 from export.core.cache import StageCache
-from export.evaluation.gate_run import NEW_TOKENS, OpenGraph, TaskCheck
-from export.evaluation.gates import GateError, judge
-from export.evaluation.metrics import Arrays, ParityResult, Sample, compare
-from export.evaluation.parity import references, sample_inputs
-from export.evaluation.task_error import TaskError, prompt_parts
-from export.graphs.build import graph_names, write_graph
+from export.evaluation.gates import GateError, OpenGraph, judge
+from export.evaluation.parity import ParityResult, Sample, compare, references
+from export.graphs.build import write_graph
 from export.model.network import TicVla, build
 from export.pipeline.artifacts import build_artifacts
 from export.pipeline.build import Pipeline, WeightsRecord
-from export.target.file import with_settings
+from export.targets.file import graph_names, with_settings
 from tests.support.export.export_job import NANO, TARGET, job, manifest, progress
 
 GRAPHS = graph_names(pair=False)
@@ -61,26 +61,15 @@ def test_the_directory_holds_what_the_design_lists(artifacts_dir: Path) -> None:
 
 
 @pytest.mark.parametrize("name", GRAPHS)
-def test_every_graph_passed_the_gate_on_eight_inputs(artifacts_dir: Path, name: str) -> None:
+def test_every_graph_passed_the_gate_on_eight_inputs_and_on_the_task(artifacts_dir: Path, name: str) -> None:
     parity, gate = manifest(artifacts_dir)["graphs"][name]["parity"], TARGET.gate(name)
     assert parity["verdict"] == "PASS"
     assert parity["inputs"] == 8
     assert parity["cosine"] >= gate.min_cosine
     assert parity["max_abs"] <= gate.max_abs
     assert parity["min_difference"] >= gate.min_difference
-
-
-@pytest.mark.parametrize("name", GRAPHS)
-def test_every_graph_was_run_on_the_provider_that_ships_and_on_the_task(artifacts_dir: Path, name: str) -> None:
-    parity = manifest(artifacts_dir)["graphs"][name]["parity"]
-    assert parity["provider"] == "CPUExecutionProvider"
-    assert parity["shipping_provider_checked"] is True
-    assert parity["task"]["waypoint_cm"] < TARGET.task_gate.waypoint_cm
+    assert (parity["provider"], parity["shipping_provider_checked"]) == ("CPUExecutionProvider", True)
     assert [delay_s for delay_s, _ in parity["task"]["by_delay_cm"]] == [0, 1, 2, 3, 5, 7, 10]
-
-
-def test_the_language_model_chooses_the_same_tokens(artifacts_dir: Path) -> None:
-    assert manifest(artifacts_dir)["graphs"]["language_model"]["parity"]["top1"] == 1.0
 
 
 @pytest.mark.parametrize("name", GRAPHS)
@@ -92,60 +81,19 @@ def test_the_manifest_says_what_a_graph_is_made_of_and_how_it_is_opened(artifact
     assert graph["session"] == {"provider": "CPUExecutionProvider", "options": {}, "threads": 1, "engine": False}
 
 
-def test_the_manifest_holds_plan_calibration_and_target(artifacts_dir: Path) -> None:
-    content = manifest(artifacts_dir)
-    assert content["plan"]["tagged"] in ("modelled", "measured")
-    assert content["provenance"]["calibration"]["name"] == DEFAULT_CALIBRATION
-    assert len(content["provenance"]["calibration"]["sha256"]) == 64
-    assert content["provenance"]["target"]["gates"]["task"]["waypoint_cm"] == TARGET.task_gate.waypoint_cm
-
-
-@pytest.mark.parametrize("name", GRAPHS)
-def test_no_graph_names_the_machine_it_was_made_on(artifacts_dir: Path, name: str) -> None:
-    data = (artifacts_dir / f"{name}.onnx").read_bytes()
-    assert str(Path(__file__).parents[3]).encode() not in data
-    assert b"site-packages" not in data
-    proto = onnx.load_from_string(data)
-    assert all(not t.external_data for t in proto.graph.initializer)
-
-
-@pytest.mark.parametrize("name", ["manifest.json", "report.json", "report.html"])
-def test_no_report_names_the_machine_it_was_made_on(artifacts_dir: Path, name: str) -> None:
-    text = (artifacts_dir / name).read_text()
-    for place in (artifacts_dir, Path(__file__).parents[3], Path.home()):
-        assert str(place) not in text
-
-
-def test_the_manifest_says_that_the_weights_are_untrained(artifacts_dir: Path) -> None:
-    assert manifest(artifacts_dir)["model"]["trained"] is False
-    assert "untrained" in (artifacts_dir / "report.html").read_text()
-    assert not load_artifacts(artifacts_dir).trained
+def test_no_file_names_the_machine_it_was_made_on(artifacts_dir: Path) -> None:
+    for path in artifacts_dir.iterdir():
+        for place in (str(artifacts_dir), str(Path(__file__).parents[3]), str(Path.home()), "site-packages"):
+            assert place.encode() not in path.read_bytes()
 
 
 # ---- the gate
-
-
-@pytest.mark.parametrize("name", GRAPHS)
-def test_the_eight_inputs_are_all_different(name: str) -> None:
-    inputs = [sample_inputs(NANO, name, i) for i in range(8)]
-    keys = [b"".join(a.tobytes() for a in feeds.values()) for feeds in inputs]
-    assert len(set(keys)) == 8
 
 
 @pytest.mark.parametrize("name", ["vision_encoder", "action_expert"])
 def test_a_graph_that_ignores_its_input_fails(samples: dict[str, list[Sample]], name: str) -> None:
     first = samples[name][0].expected
     assert verdict(name, compare(name, samples[name], lambda _: first)) == "FAIL"
-
-
-def test_a_small_error_in_one_output_fails(samples: dict[str, list[Sample]], artifacts: Artifacts) -> None:
-    graph = OpenGraph(artifacts, "action_expert", threads=1)
-    assert verdict("action_expert", compare("action_expert", samples["action_expert"], graph)) == "PASS"
-
-    def shifted(feeds: Arrays) -> Arrays:
-        return {name: y + np.float32(2e-3) for name, y in graph(feeds).items()}
-
-    assert verdict("action_expert", compare("action_expert", samples["action_expert"], shifted)) == "FAIL"
 
 
 @pytest.mark.parametrize("dead", ["visual_tokens", "state", "latency", "context.0.key", "context.5.value"])
@@ -157,28 +105,23 @@ def test_an_action_expert_that_ignores_one_of_its_inputs_fails(
     assert verdict("action_expert", found) == "FAIL"
 
 
-class Blind(TaskCheck):
+class Blind(LanguageModel):
     """A runner that never feeds its language model a frame."""
 
-    def language(self, artifacts: Artifacts, threads: int, provider: str | None) -> TaskError:
-        unseen = [np.zeros_like(tokens) for tokens in self._reference.visual]
-        kv, texts = [], []
-        for sample in self._samples.samples:
-            state, ids = self._torch.language(prompt_parts(sample, unseen), NEW_TOKENS)
-            kv.append(state)
-            texts.append(ids)
-        return self._compare(self._reference.visual, kv, self._torch.context, texts=texts)
+    def generate(self, segments: Sequence[Segment], **options: Any) -> Generation:
+        unseen = [Segment(s.ids, None if s.tokens is None else np.zeros_like(s.tokens)) for s in segments]
+        return super().generate(unseen, **options)
 
 
 @pytest.mark.slow
 def test_a_language_model_that_never_sees_a_frame_fails_by_the_task_alone(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("export.pipeline.build.TaskCheck", Blind)
+    monkeypatch.setattr("export.evaluation.gates.LanguageModel", Blind)
     assert main([*RANDOM, "--out", str(tmp_path / "blind"), "--cache", str(tmp_path / "cache")]) == 1
-    said = capsys.readouterr().err.splitlines()[-1]
-    assert "language_model: not the same model: deviation as a share of the plans' spread" in said
-    assert "cosine of the semantic state" in said
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert "language_model: not the same model: deviation as a share of the plans' spread" in message
+    assert "cosine of the semantic state" in message
     assert not (tmp_path / "blind").exists()
 
 
@@ -206,9 +149,9 @@ def test_a_threshold_that_is_not_met_is_exit_code_1_and_no_directory(
 ) -> None:
     arguments = [*RANDOM, "--out", str(tmp_path / "out"), "--set", "gates.task.waypoint_cm=1e-9"]
     assert main([*arguments, "--set", "gates.task.warn_waypoint_cm=1e-10"]) == 1
-    said = capsys.readouterr().err.splitlines()[-1]
-    assert "vision_encoder: not the same model: waypoint error in cm" in said
-    assert said.endswith("; nothing was written")
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert "vision_encoder: not the same model: waypoint error in cm" in message
+    assert message.endswith("; nothing was written")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -247,9 +190,9 @@ def test_two_exports_are_byte_identical_with_everything_cached_whatever_happened
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("told", [signal.SIGINT, signal.SIGTERM], ids=lambda told: told.name)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
 def test_an_interrupted_export_leaves_nothing_half_written_and_goes_on_where_it_was(
-    artifacts_dir: Path, tmp_path: Path, told: signal.Signals
+    artifacts_dir: Path, tmp_path: Path, number: signal.Signals
 ) -> None:
     cache, out = tmp_path / "cache", tmp_path / "out" / "nano"
     command = [sys.executable, "-m", "export.cli", *RANDOM, "--out", str(out), "--cache", str(cache)]
@@ -264,7 +207,7 @@ def test_an_interrupted_export_leaves_nothing_half_written_and_goes_on_where_it_
         for line in process.stderr:
             if "gate vision_encoder · " in line:
                 break
-        process.send_signal(told)
+        process.send_signal(number)
         assert process.wait(timeout=60) == 130
     finally:
         process.kill()

@@ -7,27 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from export import entry
 from export.cli import main
 from export.pipeline.build import with_exceptions
 from export.quantize.precision import Precision
-from export.target.file import list_targets
+from export.targets.file import list_targets
 from tests.support.export.export_job import manifest
 
 LOOSE = [
     f"--set=gates.vision_encoder.{key}" for key in ("min_cosine=0.9", "warn_cosine=0.9", "max_abs=10")
 ]  # for an encoder that is rounded
-
-
-def test_an_interrupt_while_modules_load_is_no_traceback(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted(*_: str) -> int:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(entry, "run_with_extra", interrupted)
-    assert entry.main() == 130
-    assert capsys.readouterr().err == "edge-export: interrupted\n"
 
 
 @pytest.mark.parametrize(
@@ -73,19 +61,6 @@ def test_a_plan_that_does_not_fit_is_refused_before_anything_is_built(
     assert main(["--target", "orin", "--model", "1b", "--set", "power.mode=10W", *arguments]) == 1
     assert "1b does not fit orin (10W): tick" in capsys.readouterr().err.splitlines()[-1]
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.slow
-def test_the_result_has_the_keys_that_other_tools_read(
-    artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["--out", str(tmp_path / "nano"), "--json", "-"]) == 0
-    result = json.loads(capsys.readouterr().out)
-    assert {"target", "model", "graphs", "plan", "peak_rss_bytes", "wall_s"} <= set(result)
-    for graph in result["graphs"].values():
-        assert {"params", "bytes", "precision", "parity"} <= set(graph)
-        assert {"cosine", "max_abs", "verdict"} <= set(graph["parity"])
-    assert {"tick_ms", "generation_ms", "average_w", "tagged"} <= set(result["plan"])
 
 
 @pytest.mark.slow

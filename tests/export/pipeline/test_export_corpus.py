@@ -44,7 +44,7 @@ def cut(directory: Path, name: str) -> None:
 
 
 def reshape(directory: Path) -> None:
-    """An action expert that takes one more number of state, said nowhere."""
+    """An action expert that takes one more number of state, which no manifest names."""
     proto = onnx.load(str(directory / "action_expert.onnx"))
     state = next(tensor for tensor in proto.graph.input if tensor.name == "state")
     state.type.tensor_type.shape.dim[1].dim_value = 4
@@ -128,14 +128,14 @@ def contents(directory: Path) -> dict[str, bytes]:
 def test_a_damaged_directory_does_not_verify_and_is_not_touched(
     artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], case: str
 ) -> None:
-    damage, said = DAMAGED[case]
+    damage, message = DAMAGED[case]
     copy = Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))
     damage(copy)
     before, beside = contents(copy), sorted(tmp_path.iterdir())
     assert main(["verify", str(copy)]) == 1
     lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("edge-export: [")]
     assert len(lines) == 1
-    assert said in lines[0]
+    assert message in lines[0]
     assert contents(copy) == before
     assert sorted(tmp_path.iterdir()) == beside
 
@@ -180,7 +180,7 @@ WRONG_ARGUMENTS: list[tuple[list[str], str]] = [
     (["--out", "x", "--set", "turbo=1"], "unknown key 'turbo'"),
     (["--out", "x", "--set", "power.mode"], "expected KEY=VALUE"),
     (["--out", "x", "--set", "runtime.tick_period_ms=soon"], "tick_period_ms"),
-    (["--out", "x", "--set", "model.action.layers=none"], "action.layers"),
+    (["--out", "x", "--set", "model.action.layers=none"], "action: layers"),
     (["--out", "x", "--set", "model.action.wheels=4"], "action.wheels is not a number of the model"),
     (["--out", "x", "--set", "model.language.max_context=128"], "exceeds the context"),
     (["--out", "x", "--cache-gb", "0"], "--cache-gb 0: expected a size above 0"),
@@ -190,16 +190,20 @@ WRONG_ARGUMENTS: list[tuple[list[str], str]] = [
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"), WRONG_ARGUMENTS, ids=lambda v: " ".join(v) if isinstance(v, list) else ""
+    ("arguments", "message"), WRONG_ARGUMENTS, ids=lambda v: " ".join(v) if isinstance(v, list) else ""
 )
 def test_wrong_arguments_get_one_line_and_their_exit_code(
-    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    arguments: list[str],
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(arguments) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
-    assert said in captured.err
+    assert message in captured.err
     assert len(captured.err.strip().splitlines()) == 1
     assert list(tmp_path.iterdir()) == []
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import copy
 import json
-import math
-import xml.etree.ElementTree as ET
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -13,7 +11,6 @@ from typing import Any
 import pytest
 
 from export.pipeline.report import precision_text, report_html, size_text
-from export.pipeline.report_plots import Dot, Line, dot_plot, line_plot
 
 
 @pytest.fixture(scope="module")
@@ -52,8 +49,9 @@ def test_the_page_is_made_of_report_json_alone(artifacts_dir: Path, report: dict
 def test_the_page_loads_nothing(report: dict[str, Any]) -> None:
     page = report_html(report)
     for tag, attributes in _Page(page).tags:
-        assert tag not in {"script", "link", "iframe", "object", "embed", "base", "img", "image", "use"}
-        assert not {"href", "src", "srcset", "onload"} & set(attributes)
+        assert tag not in {"script", "link", "iframe", "object", "embed", "base", "use"}
+        assert not {"href", "srcset", "onload"} & set(attributes)
+        assert str(attributes.get("src", "data:image/png;base64,")).startswith("data:image/png;base64,")
     assert "url(" not in page
     assert "@import" not in page
 
@@ -125,7 +123,10 @@ def test_layers_that_were_searched_are_plotted(changed: dict[str, Any]) -> None:
         "precision": {"default": "int8", "overrides": {"blocks.1.*": "fp32"}},
         "table": [{**row, "group": "*"}, {**row, "group": "blocks.1.*"}, {**row, "group": "projector.*"}],
     }
-    text = _Page(report_html(changed)).text
+    changed["sensitivity"]["vision_encoder"]["table"][1]["waypoint_cm"] = 0.0  # has no logarithm
+    page = _Page(report_html(changed))
+    text = page.text
+    assert sum(tag == "img" for tag, _ in page.tags) == 2
     assert "the 2 most sensitive groups of layers, each rounded alone to int8, filled: kept more exact" in text
 
 
@@ -139,51 +140,6 @@ def test_text_from_files_cannot_act_on_the_page(changed: dict[str, Any]) -> None
     page = report_html(changed)
     assert "<script" not in page
     assert "\u202e" not in page
-
-
-# ---- plots
-
-
-def test_plots_are_whole_svg() -> None:
-    dots = dot_plot([Dot("a<b", 0.1, True), Dot("c", 0.0, False)], "error & more", 5)
-    lines = line_plot([Line("a<b", ((0, 1), (10, 2)))], "x", "y", 2.5)
-    for svg in (dots, lines):
-        assert ET.fromstring(svg).tag == "svg"
-
-
-def test_a_larger_value_lies_further_right_and_nothing_leaves_the_picture() -> None:
-    values = [0.0, 1e-9, 0.02, 3.0, 4e5]
-    svg = ET.fromstring(dot_plot([Dot(str(v), v, False) for v in values], "error"))
-    places = [float(circle.get("cx", "nan")) for circle in svg.findall("circle")]
-    assert places == sorted(places)
-    assert places[0] > 0
-    assert places[-1] < 440
-
-
-def test_a_line_goes_up_with_its_values() -> None:
-    svg = ET.fromstring(line_plot([Line("a", ((0, 0), (5, 1), (10, 4)))], "x", "y"))
-    line = svg.find("polyline")
-    assert line is not None
-    ys = [float(point.split(",")[1]) for point in str(line.get("points")).split()]
-    assert ys == sorted(ys, reverse=True)
-
-
-@pytest.mark.parametrize(("limit", "said"), [(2.0, "gate: 2"), (50.0, "gate: 50, off the scale")])
-def test_a_gate_far_above_all_lines_is_named_not_drawn(limit: float, said: str) -> None:
-    svg = ET.fromstring(line_plot([Line("a", ((0, 1), (10, 1.5)))], "x", "y", limit))
-    assert said in [text.text for text in svg.findall("text")]
-    assert len([line for line in svg.findall("line") if line.get("stroke") == "#b3261e"]) == (limit == 2.0)
-
-
-def test_nothing_to_plot_is_no_picture() -> None:
-    assert dot_plot([], "x") == line_plot([], "x", "y") == line_plot([Line("a", ())], "x", "y") == ""
-
-
-def test_values_of_zero_alone_are_plotted_too() -> None:
-    assert ET.fromstring(dot_plot([Dot("a", 0.0, False)], "x")).tag == "svg"
-    line = ET.fromstring(line_plot([Line("a", ((0, 0.0),))], "x", "y")).find("polyline")
-    assert line is not None
-    assert all(math.isfinite(float(v)) for v in str(line.get("points")).replace(",", " ").split())
 
 
 @pytest.mark.parametrize(("count", "shown"), [(1.234e9, "1.23 GB"), (48e6, "48 MB"), (2500, "2.5 kB"), (12, "12 B")])

@@ -12,8 +12,8 @@ import pytest
 from edge.artifacts.files import seal
 from export.cli import main
 from export.core.cache import file_sha256
-from export.pipeline import verify
-from export.target.file import TARGETS_DIR
+from export.pipeline import job
+from export.targets.file import TARGETS_DIR
 from tests.support.export.export_job import manifest
 
 
@@ -35,7 +35,7 @@ def resealed(directory: Path, keys: str, value: object) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("keys", "value", "said"),
+    ("keys", "value", "message"),
     [
         ("runtime/tick_period_ms", 900, "runtime.tick_period_ms is 900, this export writes 100"),
         ("runtime/img_context_id", 7, "runtime.img_context_id is 7"),
@@ -50,12 +50,12 @@ def resealed(directory: Path, keys: str, value: object) -> Path:
     ],
 )
 def test_a_manifest_that_was_changed_and_sealed_again_does_not_verify(
-    artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], keys: str, value: object, said: str
+    artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], keys: str, value: object, message: str
 ) -> None:
     copy = resealed(Path(shutil.copytree(artifacts_dir, tmp_path / "nano")), keys, value)
     assert main(["verify", str(copy)]) == 1
     error = capsys.readouterr().err.splitlines()[-1]
-    assert said in error
+    assert message in error
 
 
 def test_another_tokenizer_does_not_verify_although_the_manifest_vouches_for_it(
@@ -95,9 +95,11 @@ def test_verify_refuses_artifacts_of_other_weights(artifacts_dir: Path, capsys: 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("shipped", "code", "says"), [(False, 2, "give that with"), (True, 1, "other weights than")])
+@pytest.mark.parametrize(
+    ("shipped", "code", "message"), [(False, 2, "give that with"), (True, 1, "other weights than")]
+)
 def test_verify_of_a_checkpoint_takes_the_checkpoint(
-    artifacts_dir: Path, tmp_path: Path, capsys: Any, monkeypatch: Any, shipped: bool, code: int, says: str
+    artifacts_dir: Path, tmp_path: Path, capsys: Any, monkeypatch: Any, shipped: bool, code: int, message: str
 ) -> None:
     saved, others, out = tmp_path / "nano.safetensors", tmp_path / "others.safetensors", tmp_path / "nano"
     for seed, weights in ((0, saved), (1, others)):
@@ -105,8 +107,8 @@ def test_verify_of_a_checkpoint_takes_the_checkpoint(
         assert main(["--out", where, "--random-weights", str(seed), "--save-weights", str(weights)]) == 0
     assert main(["--out", str(out), "--checkpoint", str(saved)]) == 0
     capsys.readouterr()
-    monkeypatch.setattr(verify, "shipped_weights", lambda config: others if shipped else None)
+    monkeypatch.setattr(job, "shipped_weights", lambda config: others if shipped else None)
     assert main(["verify", str(out)]) == code
-    told = capsys.readouterr().err
-    assert says in told and "checkpoint" in told
+    error = capsys.readouterr().err
+    assert message in error and "checkpoint" in error
     assert main(["verify", str(out), "--checkpoint", str(saved)]) == 0

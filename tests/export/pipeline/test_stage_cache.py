@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from export.core import cache as stages
-from export.core.cache import CacheError, StageCache, default_cache_dir, open_cache, stage_key
+from export.core.cache import CacheError, StageCache, open_cache, stage_key
 
 GIB = 1 << 30
 CODE = ("export.quantize.precision",)
@@ -57,10 +57,6 @@ def entries(directory: Path) -> list[str]:
     return sorted(path.name for path in directory.iterdir() if path.is_dir())
 
 
-def test_the_same_parts_name_the_same_stage_in_any_order() -> None:
-    assert stage_key("graph", {"a": 1, "b": [2]}, CODE) == stage_key("graph", {"b": [2], "a": 1}, CODE)
-
-
 @pytest.mark.parametrize(
     ("stage", "parts"),
     [("gate", {"a": 1}), ("graph", {"a": 2}), ("graph", {"a": 1, "b": 0}), ("graph", {"a": "1"}), ("graph", {})],
@@ -69,15 +65,12 @@ def test_any_other_part_names_another_stage(stage: str, parts: dict[str, object]
     assert stage_key(stage, parts, CODE) != stage_key("graph", {"a": 1}, CODE)
 
 
-def test_another_package_version_names_another_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("function", ["package_versions", "source_sha256"])
+def test_another_version_of_a_package_or_of_our_code_names_another_stage(
+    monkeypatch: pytest.MonkeyPatch, function: str
+) -> None:
     before = stage_key("graph", {}, CODE)
-    monkeypatch.setattr(stages, "package_versions", lambda: {"onnx": "0.0"})
-    assert stage_key("graph", {}, CODE) != before
-
-
-def test_another_version_of_our_code_names_another_stage(monkeypatch: pytest.MonkeyPatch) -> None:
-    before = stage_key("graph", {}, CODE)
-    monkeypatch.setattr(stages, "source_sha256", lambda _: "edited")
+    monkeypatch.setattr(stages, function, lambda *_: {"onnx": "edited"})
     assert stage_key("graph", {}, CODE) != before
 
 
@@ -133,12 +126,6 @@ def test_a_result_is_kept_as_it_was(cache: StageCache) -> None:
     assert cache.result("r", dict) == ({"cosine": 0.999, "reason": "é"}, True)
 
 
-def test_a_result_that_is_not_a_number_is_refused(cache: StageCache) -> None:
-    with pytest.raises(ValueError, match="not JSON compliant"):
-        cache.result("r", lambda: {"cosine": float("nan")})
-    assert entries(cache.directory) == []
-
-
 def flip(path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[0] ^= 1
@@ -182,14 +169,6 @@ def test_an_interrupted_build_leaves_no_entry(cache: StageCache, error: type[Bas
     assert entries(cache.directory) == []
 
 
-def test_what_a_killed_process_left_is_not_taken_for_a_result(cache: StageCache) -> None:
-    (cache.directory / "k.partial").mkdir()
-    (cache.directory / "k.partial" / "old.onnx").write_text("half")
-    entry, was_there = cache.fetch_or_build("k", writes("whole"))
-    assert not was_there
-    assert [p.name for p in sorted(entry.iterdir())] == ["entry.json", "graph.onnx"]
-
-
 def test_two_builders_of_one_stage_build_it_once(cache: StageCache) -> None:
     calls: list[str] = []
     begun, go = threading.Event(), threading.Event()
@@ -217,20 +196,10 @@ def test_the_entries_used_longest_ago_go_first(tmp_path: Path, notes: Notes) -> 
         for age, name in enumerate(("new", "middle", "old")):
             entry, _ = cache.fetch_or_build(key(name), writes("x" * 1000))
             os.utime(entry / "entry.json", ns=(10**18 - age, 10**18 - age))
+        cache.fetch_or_build(key("old"), writes("never called"))
     with open_cache(tmp_path, 2500, notes):
         pass
-    assert entries(tmp_path) == sorted([key("middle"), key("new")])
-
-
-def test_using_an_entry_makes_it_young(tmp_path: Path, notes: Notes) -> None:
-    with open_cache(tmp_path, GIB, notes) as cache:
-        for age, name in enumerate(("new", "old")):
-            entry, _ = cache.fetch_or_build(key(name), writes("x" * 1000))
-            os.utime(entry / "entry.json", ns=(10**18 - age, 10**18 - age))
-        cache.fetch_or_build(key("old"), writes("never called"))
-    with open_cache(tmp_path, 1500, notes):
-        pass
-    assert entries(tmp_path) == [key("old")]
+    assert entries(tmp_path) == sorted([key("new"), key("old")])
 
 
 def test_nothing_is_pruned_under_another_process_hands(tmp_path: Path, notes: Notes) -> None:
@@ -279,13 +248,6 @@ def test_what_a_user_puts_into_a_cache_stays_whatever_it_is_cut_to(tmp_path: Pat
     assert not (tmp_path / key("k")).exists()
 
 
-def test_the_package_that_the_interpreter_has_of_several_variants_counts() -> None:
-    versions = stages.package_versions()
-    assert {"numpy", "onnx", "tokenizers", "torch"} <= set(versions)
-    assert any(name.startswith("onnxruntime") for name in versions)
-    assert any(name.startswith("opencv-python") for name in versions)
-
-
 def test_a_directory_that_cannot_be_written_is_refused_in_one_line(tmp_path: Path, notes: Notes) -> None:
     (tmp_path / "file").touch()
     with (
@@ -308,15 +270,3 @@ def test_damaged_seconds_are_no_error(cache: StageCache, content: str) -> None:
     assert cache.timings("nano") == {}
     cache.remember_timings("nano", {"graph a": 1.0})
     assert json.loads((cache.directory / "timings.json").read_text())["nano"] == {"graph a": 1.0}
-
-
-@pytest.mark.parametrize(
-    ("environ", "expected"),
-    [
-        ({"XDG_CACHE_HOME": "/var/cache/me"}, Path("/var/cache/me/tic-vla-edge")),
-        ({"XDG_CACHE_HOME": "relative"}, Path.home() / ".cache" / "tic-vla-edge"),
-        ({}, Path.home() / ".cache" / "tic-vla-edge"),
-    ],
-)
-def test_the_cache_lies_where_the_desktop_standard_says(environ: dict[str, str], expected: Path) -> None:
-    assert default_cache_dir(environ) == expected

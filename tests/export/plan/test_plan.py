@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import io
-import json
 
 import pytest
 from rich.console import Console
 
 from export.graphs.build import linear_layers
-from export.model.config import PRESETS, TicVlaConfig
+from export.model.config import PRESETS
 from export.plan.cost import DECODE, PREFILL, action_call, context_call, language_call, vision_call
 from export.plan.plan import Plan, PlanError, plan
 from export.plan.table import plan_table
 from export.quantize.precision import Precision
-from export.target.file import Target, load_target, with_settings
-from export.target.sections import MEASURED, MODELLED, Measured
+from export.targets.file import Target, load_target, with_settings
+from export.targets.sections import MEASURED, MODELLED, Measured
 
 BIG, NANO = PRESETS["1b"], PRESETS["nano"]
 PAPER_MS = {"orin": (120.27, 4831.73), "rtx4060": (85.73, 3430.73)}
@@ -46,44 +45,6 @@ def test_the_paper_size_model_fits_the_two_boards_by_the_model(name: str) -> Non
 
 
 @pytest.mark.slow
-def test_two_calls_give_the_same_plan() -> None:
-    assert json.dumps(planned("orin").to_dict()) == json.dumps(planned("orin").to_dict())
-
-
-@pytest.mark.parametrize("name", ["orin", "rtx4060", "cpu"])
-def test_more_tokens_take_longer_and_make_the_state_older(name: str) -> None:
-    few, many = (planned(name, "runtime.tick_period_ms=5000", tokens=n) for n in (8, 64))
-    assert few.generation is not None and many.generation is not None
-    assert few.generation.ms < many.generation.ms
-    assert few.delay_s is not None and many.delay_s is not None
-    assert few.delay_s < many.delay_s
-
-
-@pytest.mark.parametrize(("exact", "coarse"), [("fp16", "int8-b32"), ("int8-b32", "int4-b32")])
-def test_a_lower_precision_takes_fewer_bytes_and_decodes_faster(exact: str, coarse: str) -> None:
-    a, b = (plan(target("orin"), BIG, {"language_model": Precision(name)}, tokens=32) for name in (exact, coarse))
-    assert stage(b, "decode")["weight_bytes"] < stage(a, "decode")["weight_bytes"]
-    assert stage(b, "decode")["moved_bytes"] < stage(a, "decode")["moved_bytes"]
-    assert stage(b, "decode")["ms"] < stage(a, "decode")["ms"]
-    assert b.memory.needed < a.memory.needed
-
-
-def test_an_override_counts_for_its_layer_alone() -> None:
-    plain, mixed = (
-        plan(target("orin"), BIG, {"language_model": p}, tokens=8)
-        for p in (Precision("int4-b32"), Precision("int4-b32", (("lm_head", "int8-b32"),)))
-    )
-    heavier = mixed.memory.weights - plain.memory.weights
-    assert heavier == pytest.approx(BIG.language.vocab * BIG.language.hidden / 2)
-
-
-@pytest.mark.slow
-def test_a_slower_mode_makes_a_longer_tick() -> None:
-    ticks = [planned("orin", f"power.mode={mode}", tokens=8).tick.ms for mode in ("40W", "25W", "15W")]
-    assert ticks == sorted(ticks)
-
-
-@pytest.mark.slow
 def test_the_stock_25_watt_mode_is_refused_with_what_exceeds_by_how_much_and_what_to_change() -> None:
     made = planned("orin", "power.mode=25W")
     assert not made.fits
@@ -95,16 +56,18 @@ def test_the_stock_25_watt_mode_is_refused_with_what_exceeds_by_how_much_and_wha
         assert part in line
 
 
-def test_a_tick_at_the_stock_25_watt_clocks_cannot_take_100_ms_even_at_the_peak() -> None:
-    roofline = target("orin").roofline
-    peak_ms = vision_call(BIG).flops() / (roofline.fp16_gflops.value * 1e9) * 1e3
-    assert peak_ms > 100
-
-
-def test_a_budget_that_control_alone_exceeds_is_refused() -> None:
-    made = planned("orin", "power.budget_w=20")
-    assert not made.fits
-    assert any("of a budget of 20 W" in reason for reason in made.reasons)
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "setting", "reason"),
+    [
+        ("orin", "power.budget_w=20", "of a budget of 20 W"),
+        ("orin", "runtime.max_delay_s=1", "the ceiling is 1 s"),
+        ("rtx4060", "device.memory_gib=4", "exceeds the 3.00 GiB"),
+    ],
+)
+def test_a_plan_that_exceeds_power_age_or_memory_says_which(name: str, setting: str, reason: str) -> None:
+    made = planned(name, setting)
+    assert not made.fits and any(reason in line for line in made.reasons)
 
 
 @pytest.mark.parametrize("budget_w", [23.0, 25.0, 27.0])
@@ -113,12 +76,6 @@ def test_reasoning_gets_what_the_budget_leaves_and_never_more(budget_w: float) -
     assert made.average_w is not None
     assert made.average_w <= budget_w + 1e-6
     assert 0 < made.duty <= 1
-
-
-def test_less_power_means_less_reasoning_but_the_same_tick() -> None:
-    rich, poor = (planned("orin", f"power.budget_w={w}", "runtime.max_delay_s=60", tokens=16) for w in (27, 23))
-    assert poor.duty < rich.duty
-    assert poor.tick.ms == rich.tick.ms
 
 
 @pytest.mark.slow
@@ -131,46 +88,16 @@ def test_tokens_are_cut_so_that_the_state_stays_young_enough() -> None:
     assert any("keep Δt in bounds" in warning for warning in made.warnings)
 
 
-def test_a_state_that_gets_too_old_without_any_new_token_is_refused() -> None:
-    made = planned("orin", "runtime.max_delay_s=1")
-    assert any("the ceiling is 1 s" in reason for reason in made.reasons)
-
-
-@pytest.mark.slow
-def test_memory_that_is_not_there_is_refused() -> None:
-    made = planned("rtx4060", "device.memory_gib=4")
-    assert any("memory" in reason and "exceeds the 3.00 GiB" in reason for reason in made.reasons)
-
-
 def test_a_tick_waits_at_most_for_the_call_in_flight_where_both_threads_share_a_device() -> None:
     made = planned("orin")
     longest = max(stage(made, name)["call_ms"] for name in ("prefill", "decode", "semantic_context"))
     assert made.tick.ms == pytest.approx(made.tick_alone.ms + longest, abs=1e-3)
 
 
-def test_larger_prefill_chunks_make_control_wait_longer() -> None:
-    small, large = (planned("orin", f"runtime.prefill_chunk_tokens={n}", tokens=8) for n in (64, 512))
-    assert small.tick.ms < large.tick.ms
-
-
-def test_an_error_bar_that_reaches_over_the_period_is_a_warning() -> None:
-    assert any("measure it on the device first" in warning for warning in planned("orin").warnings)
-
-
 def test_a_development_machine_says_what_it_cannot_do_in_time_and_is_not_made_to_stop() -> None:
     made = planned("cpu")
     assert not made.fits
     assert not target("cpu").runtime.enforce_plan
-
-
-def test_the_small_model_fits_a_cpu() -> None:
-    assert plan(target("cpu", model="nano"), NANO).fits
-
-
-def test_without_a_budget_no_power_is_claimed() -> None:
-    made = planned("cpu")
-    assert made.average_w is None
-    assert {entry["energy_j"] for entry in made.to_dict()["per_graph"].values()} == {None}
 
 
 def test_average_power_is_idle_power_and_the_stages_energy_over_time() -> None:
@@ -234,31 +161,6 @@ def test_a_point_at_another_length_only_scales_the_model() -> None:
     assert "scaled by" in entry["source"]
     assert stage(plan(base, BIG), "decode")["source"].startswith("roofline of")
     assert 50.0 < entry["ms"] < 50.0 * (1100 / 400) ** 2
-
-
-def test_a_point_of_decoding_is_per_token() -> None:
-    point = {"graph": "language_model", "precision": "int4-b32", "form": "fused", "provider": "cuda", "ms": None}
-    base = with_point(target("orin"), **point, tokens_per_s=100.0, tokens=1200, overrides={"lm_head": "int8-b32"})
-    assert stage(plan(base, BIG, tokens=20), "decode")["ms"] == pytest.approx(200.0)
-
-
-def test_the_newest_of_several_points_counts() -> None:
-    base = with_point(target("orin"))
-    newer = dataclasses.replace(base.measured[0], ms=50.0, date="2026-11-22")
-    both = dataclasses.replace(base, measured=(newer, *base.measured))
-    assert stage(plan(both, BIG), "vision_encoder")["ms"] == 50.0
-
-
-def test_every_time_says_whether_it_was_measured() -> None:
-    made = planned("cpu").to_dict()
-    assert made["tagged"] == MODELLED
-    assert {entry["tagged"] for entry in made["per_graph"].values()} == {MEASURED, MODELLED}
-    assert all(entry["source"] for entry in made["per_graph"].values())
-
-
-def test_the_keys_that_other_tools_rely_on_are_there() -> None:
-    expected = {"tick_ms", "generation_ms", "tokens", "duty", "average_w", "budget_w", "memory_bytes", "per_graph"}
-    assert expected | {"tagged"} <= set(planned("orin").to_dict())
 
 
 @pytest.mark.parametrize("config", [BIG, NANO], ids=["1b", "nano"])
@@ -349,13 +251,6 @@ def test_a_person_sees_every_stage_and_the_verdict(name: str) -> None:
     assert text.count(MODELLED) >= 1
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["orin", "rtx4060"])
-@pytest.mark.parametrize("config", [BIG, NANO], ids=["1b", "nano"])
-def test_the_engines_of_a_board_cover_the_context_of_both_models(name: str, config: TicVlaConfig) -> None:
-    assert plan(target(name, model=config.name), config).tokens >= 0
-
-
 @pytest.mark.parametrize(
     ("settings", "context", "line"),
     [
@@ -371,15 +266,3 @@ def test_an_engine_that_the_context_would_outgrow_is_refused_before_anything_is_
     with pytest.raises(PlanError, match=line) as refusal:
         plan(target("orin", *settings), config)
     assert "\n" not in str(refusal.value)
-
-
-@pytest.mark.slow
-def test_16_bit_weights_take_32_in_memory_where_activations_do() -> None:
-    sizes = {
-        (name, kind): planned(
-            name, "runtime.tick_period_ms=60000", f"graphs.vision_encoder.precision={kind}"
-        ).weight_bytes["vision_encoder"]
-        for name in ("cpu", "orin")
-        for kind in ("fp32", "fp16")
-    }
-    assert sizes["cpu", "fp16"] == sizes["cpu", "fp32"] == 2 * sizes["orin", "fp16"]

@@ -34,14 +34,19 @@ def answer(data: str) -> Response_:
 
 
 @pytest.fixture
-def link(dds_domain: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[RobotLink]:
+def bus(dds_domain: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bus]:
     """Reads what this process writes too, and keeps what is large: cheaper than a process that writes."""
     reader = Bus.reader
-    monkeypatch.setattr(robot_link, "_MAX_KEPT_BYTES", 10_000_000)
     monkeypatch.setattr(Bus, "reader", lambda self, *given, **named: reader(self, *given, **named | {"foreign": False}))
-    link = RobotLink(load_robot_config(GO2_SIM, domain=dds_domain), lambda _: None)
-    yield link
-    link._bus.close()
+    bus = Bus(DdsConfig(dds_domain, "lo", ("127.0.0.1",)), max_sample_bytes=10_000_000)
+    monkeypatch.setattr(robot_link, "Bus", lambda *_, **__: bus)
+    yield bus
+    bus.close()
+
+
+@pytest.fixture
+def link(bus: Bus, dds_domain: int) -> RobotLink:
+    return RobotLink(load_robot_config(GO2_SIM, domain=dds_domain), lambda _: None)
 
 
 @pytest.fixture
@@ -69,21 +74,25 @@ def read_until(link: RobotLink, done: Any) -> Report:
     return reports[-1]
 
 
-def test_an_answer_of_four_megabytes_is_counted_and_not_decoded(link: RobotLink, decoded: list[int]) -> None:
-    link._bus.writer(ids.response_topic(ids.SPORT_SERVICE), Response_).write(answer(FOUR_MB))
+def test_an_answer_of_four_megabytes_is_counted_and_not_decoded(bus: Bus, link: RobotLink, decoded: list[int]) -> None:
+    bus.writer(ids.response_topic(ids.SPORT_SERVICE), Response_).write(answer(FOUR_MB))
     read_until(link, lambda _: link.dropped()[0] == 1)
     assert decoded == []
 
 
-def test_a_request_of_four_megabytes_is_a_second_commander_and_not_decoded(link: RobotLink, decoded: list[int]) -> None:
-    writer = link._bus.writer(ids.request_topic(ids.SPORT_SERVICE), Request_)
+def test_a_request_of_four_megabytes_is_a_second_commander_and_not_decoded(
+    bus: Bus, link: RobotLink, decoded: list[int]
+) -> None:
+    writer = bus.writer(ids.request_topic(ids.SPORT_SERVICE), Request_)
     writer.write(make_request(1, ids.MOVE, FOUR_MB, noreply=True))
     assert read_until(link, lambda report: report.foreign).foreign == "sport unreadable request"
     assert decoded == []
 
 
-def test_a_step_takes_a_few_samples_of_a_topic_and_the_next_ones_the_rest(link: RobotLink, decoded: list[int]) -> None:
-    writer = link._bus.writer(ids.response_topic(ids.SPORT_SERVICE), Response_, depth=8)
+def test_a_step_takes_a_few_samples_of_a_topic_and_the_next_ones_the_rest(
+    bus: Bus, link: RobotLink, decoded: list[int]
+) -> None:
+    writer = bus.writer(ids.response_topic(ids.SPORT_SERVICE), Response_, depth=8)
     for _ in range(8):
         writer.write(answer("small"))
     each = []
@@ -95,22 +104,22 @@ def test_a_step_takes_a_few_samples_of_a_topic_and_the_next_ones_the_rest(link: 
 
 
 @pytest.mark.parametrize("stick", [math.nan, 1.6, -1e30, math.inf])
-def test_the_stop_keys_count_whatever_the_sticks_say(link: RobotLink, stick: float) -> None:
-    link._bus.writer(ids.REMOTE_TOPIC, WirelessController_).write(WirelessController_(0.0, stick, 0.0, 0.0, L2_B))
+def test_the_stop_keys_count_whatever_the_sticks_say(bus: Bus, link: RobotLink, stick: float) -> None:
+    bus.writer(ids.REMOTE_TOPIC, WirelessController_).write(WirelessController_(0.0, stick, 0.0, 0.0, L2_B))
     assert read_until(link, lambda report: report.remote_estop).remote_estop
     assert link.dropped()[0] == 1
 
 
-def test_the_battery_is_looked_for_in_every_step_until_it_has_reported(
+def test_the_battery_is_read_in_every_step_until_it_has_reported(
     link: RobotLink, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    looked: list[object] = []
+    topics: list[str] = []
     monkeypatch.setattr(
-        robot_link, "take_each", lambda reader, *given: looked.append(reader) or take_each(reader, *given)
+        robot_link, "take_each", lambda reader, *given: topics.append(reader.topic.name) or take_each(reader, *given)
     )
     for _ in range(3):
         link.read(0)
-    assert looked.count(link._low_states) == 3
+    assert topics.count(ids.LF_LOW_STATE_TOPIC) == 3
 
 
 def test_what_is_larger_than_all_that_is_kept_is_dropped_by_dds_itself(dds_domain: int) -> None:

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from firmware_bridge.unitree.messages import idl, idl_low
 from firmware_bridge.unitree.messages.crc import LOW_STATE_LAYOUT, crc32_mpeg2, crc_of_words, low_state_crc
 from firmware_bridge.unitree.rpc import make_request
-from sim_hil.protocols.unitree.state import LowStateMessage, OdometryFrame, sport_mode_state
+from sim_hil.protocols.unitree.odometry import OdometryFrame
+from sim_hil.protocols.unitree.state import LowStateMessage, sport_mode_state
 from tests.support.robot.fake_go2 import standing
 
 TYPES = [
@@ -92,8 +93,9 @@ def test_low_state_layout_is_the_c_struct_less_its_crc() -> None:
 
 
 def test_low_state_crc_depends_on_every_motor_and_survives_the_wire() -> None:
-    message = LowStateMessage().fill(standing(joint_q_rad=np.linspace(-1, 1, 12)), OdometryFrame((0.0, 0.0, 0.0)))
-    received = idl_low.LowState_.deserialize(message.serialize())
+    low = LowStateMessage()
+    low.update(standing(joint_q_rad=np.linspace(-1, 1, 12)), OdometryFrame((0.0, 0.0, 0.0)))
+    received = idl_low.LowState_.deserialize(low.encode())
     assert low_state_crc(received) == received.crc
     seen = {received.crc}
     for motor in received.motor_state:

@@ -11,13 +11,14 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
 from cyclonedds.domain import DomainParticipant
 
 from firmware_bridge.client import BridgeClient, BridgeStatus, BridgeUnavailable
 from firmware_bridge.operate import operate
 from firmware_bridge.unitree.dds import Bus
 from firmware_bridge.unitree.messages import ids
-from tests.support.processes import GO2_SIM, REPOSITORY, HostStall, Running, running, wait_for
+from tests.support.processes import GO2_SIM, REPOSITORY, Running, running, wait_for
 from tests.support.robot.fake_go2 import FakeGo2
 
 ZERO = (0.0, 0.0, 0.0)
@@ -25,6 +26,10 @@ STANDING_UP = frozenset({ids.STAND_UP, ids.RECOVERY_STAND, ids.BALANCE_STAND})
 REST_MPS = 0.05
 L2, B = 1 << 5, 1 << 9
 SPEED_MPS = 0.8
+MANY = 20
+REPETITIONS = pytest.mark.parametrize(
+    "repetitions", [1, pytest.param(MANY, marks=[pytest.mark.repeated, pytest.mark.timeout(900)])]
+)
 
 
 class Peer(Bus):
@@ -95,7 +100,7 @@ class Rig:
         self.socket, self.latch = folder / "bridge.sock", folder / "bridge.sock.latch"
 
     def reset(self) -> None:
-        """A robot that stands, walks as commanded and has heard nothing."""
+        """A robot that stands, walks as commanded and has received nothing."""
         self.robot.reset()
         self.robot.mode, self.robot.walks = ids.MODE_BALANCE_STAND, True
 
@@ -134,16 +139,16 @@ class Rig:
     def moved_since(self, since_ns: int) -> bool:
         """Whether the robot has received a command that moves it."""
         return any(
-            heard.received_ns > since_ns and (heard.api_id in STANDING_UP or heard.velocity not in (None, ZERO))
-            for heard in list(self.robot.heard)
+            one.received_ns > since_ns and (one.api_id in STANDING_UP or one.velocity not in (None, ZERO))
+            for one in list(self.robot.received)
         )
 
     def zero_after_ms(self, since_ns: int, timeout_s: float = 3.0) -> float:
         """From `since_ns` until the first zero Move after which only zeros came for 0.3 s."""
-        heard = self.robot.heard
+        received = self.robot.received
 
         def first() -> int | None:
-            moves = [one for one in list(heard) if one.velocity is not None and one.received_ns > since_ns]
+            moves = [one for one in list(received) if one.velocity is not None and one.received_ns > since_ns]
             last = max((index for index, one in enumerate(moves) if one.velocity != ZERO), default=-1)
             return moves[last + 1].received_ns if last + 1 < len(moves) else None
 
@@ -172,6 +177,3 @@ def report(name: str, values: dict[str, list[float]]) -> None:
     path.parent.mkdir(exist_ok=True)
     table = json.loads(path.read_text()) if path.exists() else {}
     path.write_text(json.dumps({**table, name: found}, indent=2) + "\n")
-
-
-__all__ = ["L2", "REST_MPS", "SPEED_MPS", "B", "Driver", "FakeGo2", "HostStall", "Peer", "Rig", "report"]

@@ -46,28 +46,23 @@ def is_trusted(uid: int, path: Path = SERVICE, own_uid: int = RUNNER, **changes:
 
 
 class TestTrust:
-    def test_the_runner_believes_the_bridges_user_in_the_folder_that_root_gave_it(self) -> None:
-        assert is_trusted(BRIDGE)
+    """Which listeners a client accepts as the bridge."""
 
-    def test_root_and_the_own_user_are_believed_anywhere(self) -> None:
+    @pytest.mark.parametrize("own_uid", [RUNNER, 0])
+    def test_the_bridges_user_in_the_folder_that_root_gave_it_and_no_third_user(self, own_uid: int) -> None:
+        assert is_trusted(BRIDGE, own_uid=own_uid)
+        assert not is_trusted(STRANGER, own_uid=own_uid)
+
+    def test_root_and_the_own_user_anywhere(self) -> None:
         assert is_trusted(0, Path("/tmp/x/bridge.sock")) and is_trusted(RUNNER, Path("/tmp/x/bridge.sock"))
 
-    def test_a_third_user_is_not_believed_in_that_folder(self) -> None:
-        assert not is_trusted(STRANGER)
-
-    def test_a_user_that_has_made_the_folder_by_itself_is_not_believed(self) -> None:
+    def test_no_user_that_has_made_the_folder_by_itself(self) -> None:
         assert not is_trusted(STRANGER, run=(0, 0o41777), service=(STRANGER, 0o40755))
         assert not is_trusted(STRANGER, run=(STRANGER, 0o40755), service=(STRANGER, 0o40755))
 
     @pytest.mark.parametrize("mode", [0o40731, 0o40713, 0o120777, 0o100644])
-    def test_a_folder_that_others_may_write_to_or_that_is_none_is_not_believed(self, mode: int) -> None:
+    def test_no_folder_that_others_may_write_to_nothing_else_and_nothing_missing(self, mode: int) -> None:
         assert not is_trusted(BRIDGE, service=(BRIDGE, mode))
-
-    def test_root_does_not_believe_a_third_user_either(self) -> None:
-        assert is_trusted(BRIDGE, own_uid=0)
-        assert not is_trusted(STRANGER, own_uid=0)
-
-    def test_a_path_that_is_not_there_is_not_believed(self) -> None:
         assert not is_trusted(BRIDGE, Path("/nowhere/bridge.sock"))
 
 
@@ -127,15 +122,8 @@ def socket_path(given_folder: Path, tmp_path_factory: pytest.TempPathFactory) ->
     arguments = ["--robot", robot_file(given_folder), "--socket", path, "--runner-group", runners.gr_name]
     arguments += ["--operator-group", operators.gr_name]
     numbers = f"{BRIDGE},{runners.gr_gid},{operators.gr_gid}"
-    with running(
-        "tests.support.robot.as_user",
-        BRIDGE,
-        numbers,
-        "bridge",
-        *arguments,
-        folder=folder,
-        ready="waiting for interface",
-    ):
+    user = ("tests.support.robot.as_user", BRIDGE, numbers, "bridge")
+    with running(*user, *arguments, folder=folder, ready="waiting for interface"):
         yield path
 
 

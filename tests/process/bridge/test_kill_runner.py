@@ -18,7 +18,6 @@ import pytest
 from tests.support.processes import (
     GO2_SIM,
     HostStall,
-    Running,
     check_stop_latency,
     hil_arguments,
     read_trace,
@@ -80,13 +79,9 @@ def walk_then(rig: Rig, number: signal.Signals) -> tuple[int, int]:
         since_ns = time.monotonic_ns()
         os.kill(runner.pid, number)
         time.sleep(1.0)
-        _finish(runner)
+        runner.process.kill()
+        runner.process.wait()
         return since_ns, rig.first_lasting_zero_ns(since_ns) - since_ns
-
-
-def _finish(runner: Running) -> None:
-    runner.process.kill()
-    runner.process.wait()
 
 
 @pytest.mark.slow

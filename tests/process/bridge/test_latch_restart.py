@@ -4,26 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
-from tests.process.bridge.stop_rig import L2, B, HostStall, Rig
-from tests.support.processes import Running, check_stop_latency, wait_for
+from tests.process.bridge.stop_rig import L2, REPETITIONS, B, Rig
+from tests.support.processes import HostStall, Running, check_stop_latency, wait_for
 from tests.support.robot.fake_go2 import FakeGo2
 
 pytestmark = pytest.mark.process
-
-MANY = 20
-
-
-@pytest.fixture(scope="module")
-def robot(dds_domain: int) -> Iterator[FakeGo2]:
-    robot = FakeGo2(dds_domain)
-    yield robot
-    robot.close()
 
 
 @pytest.fixture
@@ -56,7 +46,7 @@ def is_not_driven_until_an_operator_arms(rig: Rig, wait_s: float = 0.7) -> None:
         wait_for(lambda: rig.robot.speed_mps > 0.3, 10, "the runner that an operator has armed")
 
 
-@pytest.mark.parametrize("repetitions", [1, pytest.param(MANY, marks=[pytest.mark.repeated, pytest.mark.timeout(900)])])
+@REPETITIONS
 def test_a_killed_bridges_successor_drives_no_runner_until_an_operator_arms(rig: Rig, repetitions: int) -> None:
     with contextlib.ExitStack() as bridges:
         bridge = bridges.enter_context(rig.bridge())

@@ -16,27 +16,17 @@ from firmware_bridge.client import BridgeClient
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.messages.idl import SportModeState_, WirelessController_
 from firmware_bridge.unitree.rpc import RpcClient
+from sim_hil.protocols.unitree.odometry import OdometryFrame
 from sim_hil.protocols.unitree.services.idl_command import LowCmd_
-from sim_hil.protocols.unitree.services.leases import APPLY
-from sim_hil.protocols.unitree.state import OdometryFrame, sport_mode_state
-from tests.process.bridge.stop_rig import L2, REST_MPS, B, HostStall, Peer, Rig, report
-from tests.support.processes import Running, wait_for
+from sim_hil.protocols.unitree.services.service import APPLY
+from sim_hil.protocols.unitree.state import sport_mode_state
+from tests.process.bridge.stop_rig import L2, MANY, REPETITIONS, REST_MPS, B, Peer, Rig, report
+from tests.support.processes import HostStall, Running, wait_for
 from tests.support.robot.fake_go2 import FakeGo2, standing
 
-MANY = 20
 Series = dict[str, list[float]]
-REPETITIONS = pytest.mark.parametrize(
-    "repetitions", [1, pytest.param(MANY, marks=[pytest.mark.repeated, pytest.mark.timeout(900)])]
-)
 
 pytestmark = pytest.mark.process
-
-
-@pytest.fixture(scope="module")
-def robot(dds_domain: int) -> Iterator[FakeGo2]:
-    robot = FakeGo2(dds_domain)
-    yield robot
-    robot.close()
 
 
 @pytest.fixture(scope="module")
@@ -210,9 +200,7 @@ class TestPermission:
         repeat("permission", repetitions, once)
 
     @pytest.mark.slow
-    @pytest.mark.parametrize(
-        "repetitions", [1, pytest.param(MANY, marks=[pytest.mark.repeated, pytest.mark.timeout(900)])]
-    )
+    @REPETITIONS
     def test_it_expires_after_ten_seconds(self, rig: Rig, bridge: Running, repetitions: int) -> None:
         rig.reset()
         assert rig.operate("stop")[0] == 0
@@ -254,7 +242,7 @@ class TestNotAlone:
                 time.sleep(0.5)
                 assert not rig.moved_since(since_ns)
                 assert runner.status is not None and runner.status.blocked_by == "second_publisher"
-            driven = [one for one in second.heard if one.velocity not in (None, (0.0, 0.0, 0.0))]
+            driven = [one for one in second.received if one.velocity not in (None, (0.0, 0.0, 0.0))]
             assert all(one.received_ns < since_ns for one in driven), "the second robot was driven"
             second.close()
             wait_for(lambda: rig.operate("status")[1]["blocked_by"] != "second_publisher", 15, "a robot alone again")

@@ -54,6 +54,7 @@ def test_with_neither_a_runner_nor_a_bridge_it_fails_and_names_the_remote(tmp_pa
 
 @pytest.fixture
 def robot(dds_domain: int) -> Iterator[FakeGo2]:
+    """Gone at the end of its test: the simulated robot below must be the only one."""
     robot = FakeGo2(dds_domain)
     yield robot
     robot.close()
@@ -88,9 +89,9 @@ def test_a_driven_robot_stops_and_no_runner_arms_before_an_operator_does(robot: 
         ended_ns = time.monotonic_ns()
         assert done.returncode == 0, done.stderr
         assert "stopped" in done.stdout and "`edge-bridge arm`" in done.stdout
-        first_zero = next(heard for heard in robot.moves() if heard.velocity == ZERO and _lasts(robot, heard))
+        first_zero = next(command for command in robot.moves() if command.velocity == ZERO and _lasts(robot, command))
         check_stop_latency(first_zero.received_ns - ended_ns, 0, ended_ns, host)
-        assert ids.STOP_MOVE in [heard.api_id for heard in robot.heard]
+        assert ids.STOP_MOVE in [command.api_id for command in robot.received]
     with side.drive():
         wait_for(lambda: "arm refused" in side.bridge.stderr(), 10, "the refusal")
         time.sleep(0.5)
@@ -99,10 +100,10 @@ def test_a_driven_robot_stops_and_no_runner_arms_before_an_operator_does(robot: 
         wait_for(robot.is_driven, 20, "the robot is driven again")
 
 
-def _lasts(robot: FakeGo2, heard: object) -> bool:
+def _lasts(robot: FakeGo2, command: object) -> bool:
     """Whether nothing but zero came after this one."""
     moves = robot.moves()
-    return all(later.velocity == ZERO for later in moves[moves.index(heard) :])  # type: ignore[arg-type]
+    return all(later.velocity == ZERO for later in moves[moves.index(command) :])  # type: ignore[arg-type]
 
 
 def test_a_bridge_that_hangs_is_no_confirmed_stop(robot: FakeGo2, side: Side) -> None:

@@ -1,4 +1,4 @@
-"""Runs `edge-hil --protocol mavlink` beside somebody else's client and collects what both saw."""
+"""Runs `edge-hil --protocol mavlink` with another project's client and collects the results of both."""
 
 from __future__ import annotations
 
@@ -37,19 +37,9 @@ def run_session(folder: Path, client: list[str], *more: str, after_s: float = 0.
     """`client` is run with the UDP port that the rover calls and `more`; the simulator goes on `after_s` longer."""
     called = free_udp_port()
     hil_file, trace_file = folder / "hil.json", folder / "hil.jsonl"
-    command = [
-        sys.executable,
-        "-m",
-        "sim_hil.hil.command",
-        "--robot",
-        "carter",
-        "--protocol",
-        "mavlink",
-        "--scene",
-        "corridor",
-    ]
-    command += ["--camera", "none", "--link", f"udp:127.0.0.1:0,to=127.0.0.1:{called}"]
-    command += ["--json", str(hil_file), "--trace", str(trace_file)]
+    options = ["--robot", "carter", "--protocol", "mavlink", "--scene", "corridor", "--camera", "none"]
+    command = [sys.executable, "-m", "sim_hil.hil.command", *options]
+    command += ["--link", f"udp:127.0.0.1:0,to=127.0.0.1:{called}", "--json", str(hil_file), "--trace", str(trace_file)]
     hil = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=REPOSITORY)
     try:
         assert hil.stderr is not None

@@ -2,7 +2,7 @@
 
 It lives in an environment of its own: tools/interop/install_far_sdk.sh DIR, then
 TIC_VLA_FAR_PYTHON=DIR/venv/bin/python. Without it, or without the right to make network namespaces, these tests are
-skipped. The two meet on a cable of their own, because the binding knows DDS domain 0 only.
+skipped. Both run in a network namespace of their own, because the binding knows DDS domain 0 only.
 """
 
 from __future__ import annotations
@@ -32,19 +32,21 @@ pytestmark = [
 def session(tmp_path_factory: pytest.TempPathFactory) -> dict:
     """What the binding saw in one session with a real edge-hil."""
     folder = tmp_path_factory.mktemp("far")
-    (folder / "cable.toml").write_text('[[links]]\nname = "cable"\nkind = "frames"\nleft = "-"\nright = "-"\n')
     hil = (
         f"{sys.executable} -m sim_hil.hil.command --robot go2 --scene corridor --protocol unitree --camera none"
         f" --interface eth0 --json {folder / 'hil.json'} --trace {folder / 'hil.jsonl'}"
     )
     tests = Path(__file__).parent
     release = f"{sys.executable} {tests / 'release_joints.py'} 0 eth0"
-    client = f"sh -c '{release} && {FAR_PYTHON} {tests / 'far_sdk_client.py'} eth0'"
-    command = [sys.executable, "-m", "sim_hil.network", "between", "cable.toml", "--left", hil, "--right", client]
+    client = f"{release} && {FAR_PYTHON} {tests / 'far_sdk_client.py'} eth0"
+    script = f"""ip link set lo up && ip link add eth0 type veth peer name eth1 && ip link set eth1 up
+        ip addr add 192.168.123.161/24 dev eth0 && ip link set eth0 up && {{ {hil} & }}
+        {client}; code=$?; kill $!; wait; exit $code"""
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
     done = subprocess.run(
-        command, cwd=folder, capture_output=True, text=True, timeout=120, env=environment, check=False
-    )
+        ["unshare", "--net", "bash", "-c", script],
+        cwd=folder, capture_output=True, text=True, timeout=120, env=environment, check=False,
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr + done.stdout
     sys.stdout.write(done.stdout)  # for `pytest -s`
     seen = json.loads(done.stdout.splitlines()[-1])

@@ -38,7 +38,7 @@ def test_it_gets_all_parameters(session: Session) -> None:
     assert any(step["answer"].startswith("Received 11 parameters") for step in session.seen["steps"])
 
 
-def test_it_is_told_why_offboard_mode_is_refused(session: Session) -> None:
+def test_offboard_mode_is_refused_with_a_reason(session: Session) -> None:
     assert answer(session, "long DO_SET_MODE 1 6 0").endswith("TEMPORARILY_REJECTED")
 
 

@@ -16,6 +16,7 @@ import pytest
 from sim_hil.protocols.camera_stream import CameraServer, CameraStream, Shutter, listen
 from sim_hil.scene.scene import load_scene
 from sim_hil.simulation.physics import Simulation
+from tests.support.robot.front_end_contract import options
 
 SIZE = (160, 90)
 
@@ -60,7 +61,7 @@ def studio() -> Iterator[Studio]:
     studio.close()
 
 
-def test_a_picture_is_made_after_it_was_asked_for_and_says_when(studio: Studio) -> None:
+def test_an_image_is_rendered_after_its_request_and_has_a_stamp(studio: Studio) -> None:
     time.sleep(0.05)
     assert studio.made == 0, "nobody looks"
     response = studio.get("/frame.jpg")
@@ -82,7 +83,7 @@ def test_a_stream_is_one_new_picture_after_another(studio: Studio) -> None:
     stream.close()
 
 
-def test_whoever_leaves_is_forgotten(studio: Studio) -> None:
+def test_a_disconnected_client_is_removed(studio: Studio) -> None:
     stream = studio.get("/stream.mjpg")
     stream.readline()
     stream.close()
@@ -109,7 +110,7 @@ def state() -> np.ndarray:
 
 
 def _stream(state: np.ndarray, port: int = 0) -> CameraStream:
-    return CameraStream("corridor", robot="carter", people=0, seed=0, size=SIZE, port=port, state_length=len(state))
+    return CameraStream(options("carter", camera_size=SIZE), port, len(state))
 
 
 @pytest.mark.slow
@@ -145,19 +146,11 @@ def test_a_port_that_is_taken_is_refused_in_one_line(state: np.ndarray) -> None:
 
 
 @pytest.mark.slow
-def test_its_address_is_known_before_it_is_ready(state: np.ndarray) -> None:
-    camera = _stream(state)
-    try:
-        assert camera.port > 0 and str(camera.port) in camera.url
-    finally:
-        camera.close()
-
-
-@pytest.mark.slow
-def test_waiting_for_it_ends_when_the_run_is_stopped(state: np.ndarray) -> None:
+def test_its_address_is_known_before_it_is_ready_and_a_stop_ends_the_wait(state: np.ndarray) -> None:
     before = set(psutil.Process().children())
     camera = _stream(state)
     try:
+        assert camera.port > 0 and str(camera.port) in camera.url
         assert not camera.wait_ready([15])
     finally:
         camera.close()

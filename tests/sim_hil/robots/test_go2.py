@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
-from math import degrees, pi
+from math import pi
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ import pytest
 
 from sim_hil.robots.go2.gait import BodyMotion
 from sim_hil.robots.go2.sport import ERROR_NOT_STANDING, Measured, SportController, motor_torque
-from sim_hil.robots.go2.urdf import TORQUE_LIMITS_NM, VELOCITY_LIMITS_RADPS, go2_urdf
+from sim_hil.robots.go2.urdf import TORQUE_LIMITS_NM, VELOCITY_LIMITS_RADPS, write_go2_urdf
 from sim_hil.scene.scene import Scene, load_scene
 from sim_hil.simulation.physics import Simulation, SimulationClosedError, SportAction
 
@@ -40,7 +40,7 @@ def simulation(open_floor: Scene) -> Iterator[Simulation]:
 def _run(simulation: Simulation, seconds: float, command: tuple[float, float, float] | None = None) -> None:
     for index in range(round(seconds / Simulation.DT_S)):
         if command is not None and index % 50 == 0:
-            simulation.move(*command)
+            simulation.command(*command)
         simulation.step()
 
 
@@ -51,26 +51,11 @@ def _stand(simulation: Simulation) -> None:
     _run(simulation, 0.2)
 
 
-def _mean_body_velocity(simulation: Simulation, seconds: float, command: tuple[float, float, float]) -> np.ndarray:
-    """Mean (vx, vy, wz) over `seconds` under a command, from ground truth."""
-    samples = []
-    for _ in range(round(seconds / 0.02)):
-        _run(simulation, 0.02, command)
-        truth = simulation.truth()
-        c, s = np.cos(truth.rpy_rad[2]), np.sin(truth.rpy_rad[2])
-        vx, vy, _ = truth.velocity_world_mps
-        samples.append((c * vx + s * vy, -s * vx + c * vy, truth.gyro_radps[2]))
-    return np.mean(samples, axis=0)
-
-
-def test_robot_starts_lying(simulation: Simulation) -> None:
+def test_a_lying_robot_stands_up_locked_and_only_then_balances(simulation: Simulation) -> None:
     _run(simulation, 0.5)
     truth = simulation.truth()
-    assert truth.mode == 5
-    assert truth.body_height_m < 0.12
-
-
-def test_stand_up_ends_locked_and_balance_stand_balances(simulation: Simulation) -> None:
+    assert truth.mode == 5 and truth.body_height_m < 0.12
+    assert simulation.sport(SportAction.BALANCE_STAND) == ERROR_NOT_STANDING
     assert simulation.sport(SportAction.STAND_UP) == 0
     _run(simulation, 2.0)
     truth = simulation.truth()
@@ -102,30 +87,6 @@ def test_move_has_no_effect_unless_balanced(simulation: Simulation, prepare: tup
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("speed", [0.3, 0.5, 0.8])
-def test_forward_speed_is_tracked_within_a_tenth_and_straight(simulation: Simulation, speed: float) -> None:
-    _stand(simulation)
-    _run(simulation, 1.5, (speed, 0.0, 0.0))
-    truth = simulation.truth()
-    assert truth.mode == 3 and truth.gait_type == 1 and truth.commanded == (speed, 0, 0)
-    yaw = truth.rpy_rad[2]
-    velocity = _mean_body_velocity(simulation, 3.0, (speed, 0.0, 0.0))
-    assert velocity[0] == pytest.approx(speed, rel=0.1)
-    assert abs(velocity[1]) < 0.03
-    assert abs(degrees(simulation.truth().rpy_rad[2] - yaw)) < 3.0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("rate", [0.6, -0.6])
-def test_turning_rate_is_tracked_within_a_fifth(simulation: Simulation, rate: float) -> None:
-    _stand(simulation)
-    _run(simulation, 1.0, (0.0, 0.0, rate))
-    velocity = _mean_body_velocity(simulation, 3.0, (0.0, 0.0, rate))
-    assert velocity[2] == pytest.approx(rate, rel=0.2)
-    assert np.abs(velocity[:2]).max() < 0.05
-
-
-@pytest.mark.slow
 def test_positive_yaw_turns_left_and_positive_vy_walks_left(simulation: Simulation) -> None:
     _stand(simulation)
     _run(simulation, 1.5, (0.0, 0.2, 0.0))
@@ -136,9 +97,10 @@ def test_positive_yaw_turns_left_and_positive_vy_walks_left(simulation: Simulati
 
 def test_a_move_is_held_one_second_and_then_the_robot_stands_still(simulation: Simulation) -> None:
     _stand(simulation)
-    simulation.move(0.5, 0.0, 0.0)
+    simulation.command(0.5, 0.0, 0.0)
     _run(simulation, 0.98)
-    assert simulation.truth().commanded == (0.5, 0.0, 0.0)
+    truth = simulation.truth()
+    assert truth.commanded == (0.5, 0.0, 0.0) and truth.mode == 3 and truth.gait_type == 1
     _run(simulation, 0.04)
     assert simulation.truth().commanded == (0.0, 0.0, 0.0)
     _run(simulation, 2.5)
@@ -161,15 +123,6 @@ def test_commands_beyond_the_robots_range_are_clipped_and_do_not_topple_it(simul
     _run(simulation, 3.0, (99.0, -99.0, 99.0))
     assert simulation.truth().commanded == (3.8, -1.0, 4.0)
     assert not simulation.fell
-
-
-@pytest.mark.slow
-def test_stand_down_lies_down(simulation: Simulation) -> None:
-    _stand(simulation)
-    assert simulation.sport(SportAction.STAND_DOWN) == 0
-    _run(simulation, 2.0)
-    truth = simulation.truth()
-    assert truth.mode == 5 and truth.body_height_m < 0.12
 
 
 @pytest.mark.slow
@@ -253,16 +206,6 @@ def test_recovery_turns_a_robot_on_its_back_over(simulation: Simulation, roll: f
 
 
 @pytest.mark.slow
-def test_walking_into_a_wall_is_noticed_and_does_not_topple_the_robot(corridor: Scene) -> None:
-    simulation = Simulation(replace(corridor, start=(26.0, 0.0, 0.0)), people=0, seed=0)
-    _stand(simulation)
-    _run(simulation, 6.0, (0.5, 0.0, 0.0))
-    assert simulation.collided_with() & {"end wall", "exit door"}
-    assert not simulation.fell
-    simulation.close()
-
-
-@pytest.mark.slow
 def test_velocities_agree_with_positions(simulation: Simulation) -> None:
     _stand(simulation)
     _run(simulation, 1.5, (0.5, 0.0, 0.3))
@@ -284,29 +227,6 @@ def test_feet_carry_the_robot_where_kinematics_says_they_are(simulation: Simulat
     assert np.sign(truth.foot_position_body_m[:, 1]).tolist() == [-1, 1, -1, 1]
 
 
-@pytest.mark.slow
-def test_same_seed_and_calls_give_the_same_motion(corridor: Scene) -> None:
-    ends = []
-    for _ in range(2):
-        simulation = Simulation(corridor, people=3, seed=5)
-        _stand(simulation)
-        _run(simulation, 2.0, (0.6, 0.0, 0.2))
-        ends.append(simulation.render_state())
-        simulation.close()
-    assert np.array_equal(ends[0], ends[1])
-
-
-@pytest.mark.slow
-def test_joints_stay_within_the_motors_speeds_and_torques_at_full_speed(simulation: Simulation) -> None:
-    _stand(simulation)
-    _run(simulation, 1.5, (1.1, 0.0, 0.0))
-    for index in range(1500):
-        _run(simulation, Simulation.DT_S, (1.1, 0.0, 0.0) if index % 50 == 0 else None)
-        truth = simulation.truth()
-        assert (np.abs(truth.joint_dq_radps.reshape(4, 3)) < VELOCITY_LIMITS_RADPS).all()
-        assert (np.abs(truth.joint_tau_nm.reshape(4, 3)) <= TORQUE_LIMITS_NM).all()
-
-
 @pytest.mark.parametrize("joint", [0, 1, 2])
 def test_a_motor_drives_less_and_less_towards_its_top_speed_but_always_brakes(joint: int) -> None:
     torque, speed = TORQUE_LIMITS_NM[joint], VELOCITY_LIMITS_RADPS[joint]
@@ -319,7 +239,10 @@ def test_a_motor_drives_less_and_less_towards_its_top_speed_but_always_brakes(jo
 
 def test_a_joint_without_torque_is_held_by_its_dry_friction(simulation: Simulation) -> None:
     """Weightless, a torque below the friction (0.2 N.m) moves nothing and one above it does."""
-    body, calf = simulation.robot.body, simulation.robot._joints[2]
+    body = simulation.robot.body
+    links = range(pybullet.getNumJoints(body, physicsClientId=simulation.client))
+    names = [pybullet.getJointInfo(body, link, physicsClientId=simulation.client)[1] for link in links]
+    calf = names.index(b"FR_calf")
     pybullet.setGravity(0, 0, 0, physicsClientId=simulation.client)
     pybullet.resetBasePositionAndOrientation(body, (0, 0, 1), (0, 0, 0, 1), physicsClientId=simulation.client)
     pybullet.resetJointState(body, calf, -1.8, physicsClientId=simulation.client)
@@ -334,8 +257,8 @@ def test_a_joint_without_torque_is_held_by_its_dry_friction(simulation: Simulati
     assert abs(turned[0]) < 1e-3 and turned[1] > 0.05
 
 
-def test_no_line_of_the_urdf_is_longer_than_the_engine_reads() -> None:
-    assert max(len(line) for line in go2_urdf().splitlines()) < 8000
+def test_no_line_of_the_urdf_is_longer_than_the_engine_reads(tmp_path: Path) -> None:
+    assert max(len(line) for line in write_go2_urdf(tmp_path).read_text().splitlines()) < 8000
 
 
 def test_a_running_simulation_keeps_no_files(

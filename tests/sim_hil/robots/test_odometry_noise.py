@@ -57,11 +57,6 @@ def test_the_drift_of_a_metre_has_the_levels_size_whatever_the_step(step_m: floa
     assert along / level.translation_m_per_m == pytest.approx(expected, rel=0.15)
 
 
-def test_the_levels_are_the_papers() -> None:
-    found = {name: (lv.translation_m_per_m, math.degrees(lv.rotation_rad_per_m)) for name, lv in LEVELS.items()}
-    assert found == {"none": (0.0, 0.0), "typical": (0.02, pytest.approx(1.0)), "severe": (0.05, pytest.approx(5.0))}
-
-
 @pytest.mark.parametrize("values", [(-0.1, 0.0, 1.0), (0.0, math.nan, 1.0), (0.0, 0.0, 0.0)])
 def test_a_level_that_means_nothing_is_refused(values: tuple[float, float, float]) -> None:
     with pytest.raises(ValueError, match="odometry noise"):

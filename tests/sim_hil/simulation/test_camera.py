@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
+from dataclasses import replace
 from math import cos, pi, radians, sin
-from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -19,7 +18,6 @@ from sim_hil.scene.scene import load_scene
 from sim_hil.simulation import renderer as world_renderer
 from sim_hil.simulation.camera import CameraWorld
 from sim_hil.simulation.physics import Simulation
-from sim_hil.world.drawing.textures import sign
 
 WIDTH, HEIGHT = 320, 180
 NOWHERE = (-100.0, -100.0, 0.0, 0.0, 0.0)
@@ -34,7 +32,9 @@ def world() -> Iterator[CameraWorld]:
 
 @pytest.fixture(scope="module")
 def bare_world() -> Iterator[CameraWorld]:
-    world = CameraWorld(load_scene("corridor").without("vending machine"), people=1, seed=0)
+    scene = load_scene("corridor")
+    rest = tuple(thing for thing in scene.objects if thing.label != "vending machine")
+    world = CameraWorld(replace(scene, objects=rest), people=1, seed=0)
     yield world
     world.close()
 
@@ -49,16 +49,6 @@ def _state(x: float, y: float, theta: float, person: tuple[float, ...] = NOWHERE
 def _changed(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Where two pictures differ, bool [h, w]."""
     return np.abs(a.astype(int) - b.astype(int)).max(axis=2) > 20
-
-
-def test_a_picture_has_the_size_asked_for_and_is_not_blank(world: CameraWorld) -> None:
-    picture = world.render(_state(0, 0, 0), 448, 252)
-    assert picture.shape == (252, 448, 3) and picture.dtype == np.uint8
-    assert picture.std() > 15
-
-
-def test_the_same_state_gives_the_same_picture(world: CameraWorld) -> None:
-    assert np.array_equal(world.render(_state(3, 0, 0), WIDTH, HEIGHT), world.render(_state(3, 0, 0), WIDTH, HEIGHT))
 
 
 def test_the_vending_machine_is_where_the_scene_puts_it(world: CameraWorld, bare_world: CameraWorld) -> None:
@@ -79,20 +69,6 @@ def test_the_vending_machine_is_red_and_blue_not_blue_and_red(world: CameraWorld
     assert red > 0.3 and 0.05 < blue < red
 
 
-def test_lettering_is_upright_and_not_mirrored(world: CameraWorld) -> None:
-    """The exit sign's E is solid on its left and open on its right: compare with the drawing itself."""
-    scene = load_scene("corridor")
-    plate = next(thing for thing in scene.objects if thing.label == "exit sign")
-    # A camera 1 m before the sign, as high as its middle, sees nothing but the sign and the wall.
-    hfov_rad = 2 * np.arctan(0.45 / 1.035)
-    seen = world.look(_state(0, 0, 0), (26.9, 0.0, 2.35), (27.9, 0.0, 2.35), 240, 80, hfov_rad)
-    drawn = cv2.resize(sign(plate), (240, 80)).astype(float)[..., 0]
-    shown = seen.astype(float)[..., 0]
-    likeness = [np.corrcoef(view.ravel(), shown.ravel())[0, 1] for view in (drawn, drawn[:, ::-1], drawn[::-1])]
-    assert likeness[0] > 0.7
-    assert likeness[0] > max(likeness[1:]) + 0.1
-
-
 @pytest.mark.parametrize(("side", "columns"), [(0.8, slice(0, WIDTH // 2)), (-0.8, slice(WIDTH // 2, WIDTH))])
 def test_a_person_on_the_robots_left_appears_in_the_left_half(world: CameraWorld, side: float, columns: slice) -> None:
     empty = world.render(_state(10, 0, 0), WIDTH, HEIGHT)
@@ -109,22 +85,6 @@ def test_a_nearer_person_is_larger(world: CameraWorld) -> None:
         for d in (2.0, 4.0, 8.0)
     ]
     assert sizes[0] > 1.5 * sizes[1] > 2.5 * sizes[2] > 0
-
-
-def test_limbs_move_with_the_gait_phase(world: CameraWorld) -> None:
-    a, b = (world.render(_state(10, 0, 0, (12.0, 0, pi / 2, phase, 1.0)), WIDTH, HEIGHT) for phase in (0.0, 0.25))
-    assert _changed(a, b).sum() > 100
-
-
-def test_turning_left_moves_the_picture_to_the_right(world: CameraWorld) -> None:
-    person = (14.0, 0.0, pi, 0.0, 0.0)
-    columns = []
-    for theta in (0.0, 0.3):
-        shown = _changed(
-            world.render(_state(10, 0, theta), WIDTH, HEIGHT), world.render(_state(10, 0, theta, person), WIDTH, HEIGHT)
-        )
-        columns.append(np.nonzero(shown)[1].mean())
-    assert columns[1] > columns[0] + 20
 
 
 def test_pitching_down_moves_the_picture_up(world: CameraWorld) -> None:
@@ -149,32 +109,7 @@ def test_the_simulations_state_fits_the_cameras_world() -> None:
         camera.render(simulation.render_state()[:-1], 160, 90)
     simulation.close()
     camera.close()
-
-
-def test_the_robot_is_seen_from_outside(world: CameraWorld) -> None:
-    view = ((12.0, 1.0, 0.8), (10.5, 0.0, 0.3))
-    here = world.look(_state(10.5, 0, 0), *view, WIDTH, HEIGHT)
-    away = world.look(_state(20.0, 0, 0), *view, WIDTH, HEIGHT)
-    assert _changed(here, away).sum() > 800
-
-
-def test_the_top_of_a_wall_is_seen_from_above(world: CameraWorld) -> None:
-    left = next(wall for wall in load_scene("corridor").walls if wall.label == "left wall").box
-    x, y, top = 10.3, left.centre_m[1], left.size_m[2]
-    seen = world.look(_state(0, 0, 0), (x, y - 0.5, top + 1.5), (x, y, top), 41, 41, 0.02)
-    red, green, blue = seen[20, 20].astype(float)
-    assert red > green > blue > 100
-    assert (red / blue, green / blue) == pytest.approx((206 / 186, 200 / 186), abs=0.04)
-
-
-def test_a_camera_keeps_no_files_and_may_be_closed_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    camera = CameraWorld(load_scene("corridor"), people=1, seed=0)
-    camera.look(_state(0, 0, 0), (2.0, 0.0, 1.0), (0.0, 0.0, 0.3), 64, 36)
-    assert list(tmp_path.iterdir()) == []
-    camera.close()
-    camera.close()
-    assert list(tmp_path.iterdir()) == []
+    camera.close()  # may be repeated
 
 
 def test_a_squeezed_picture_shows_what_the_wide_one_shows(world: CameraWorld) -> None:

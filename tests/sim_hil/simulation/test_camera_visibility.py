@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from math import cos, pi, sin
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from sim_hil.crowd.people import RENDER_FIELDS
 from sim_hil.scene.scene import Scene, Wall, load_scene
 from sim_hil.simulation.camera import CameraWorld
-from sim_hil.world.wall_visibility import Visibility
+from sim_hil.world.wall_visibility import Sight, Visibility
 
 ROOMS = Scene(
     "rooms", (1.0, 1.0, 0.0), (2.0, 2.0), (0.0, 0.0), (20.0, 10.0), "vinyl", 2.6,
@@ -28,26 +29,25 @@ def _state(scene: Scene, x: float, y: float, theta: float, people: int) -> np.nd
     return np.array((x, y, 0.31, 0, 0, sin(theta / 2), cos(theta / 2), *(0.0, 0.85, -1.7) * 4, *rows.ravel()))
 
 
-def test_a_wall_hides_what_is_behind_it_and_nothing_before_it() -> None:
-    sight = Visibility(ROOMS, BOUNDS).look(np.array((1.0, 2.0)), EAST, 1.2)
-    assert list(Visibility(ROOMS, BOUNDS).pieces(sight)) == [0]
+LOW = replace(ROOMS, walls=(Wall("low", (10.0, 0.0), (10.0, 8.0), 0.15, 1.2, "railing"),))
 
 
-def test_what_shows_beside_the_end_of_a_wall_is_seen() -> None:
-    visibility = Visibility(ROOMS, BOUNDS)
-    sight = visibility.look(np.array((1.0, 9.0)), EAST, 1.2)
-    assert list(visibility.pieces(sight)) == [2]
-
-
-def test_a_wall_that_does_not_reach_the_ceiling_hides_nothing() -> None:
-    low = Scene(**{**ROOMS.__dict__, "walls": (Wall("low", (10.0, 0.0), (10.0, 8.0), 0.15, 1.2, "railing"),)})
-    visibility = Visibility(low, BOUNDS)
-    assert sorted(visibility.pieces(visibility.look(np.array((1.0, 2.0)), EAST, 1.2))) == [0, 1, 2]
-
-
-def test_what_is_behind_the_eye_is_left_out_unless_it_is_very_near() -> None:
-    visibility = Visibility(ROOMS, [(1.0, 4.0, 2.0, 6.0), (5.5, 4.0, 7.0, 6.0)])
-    assert list(visibility.pieces(visibility.look(np.array((8.0, 5.0)), EAST, 1.2))) == [1]
+@pytest.mark.parametrize(
+    ("scene", "bounds", "eye", "visible"),
+    [
+        pytest.param(ROOMS, BOUNDS, (1.0, 2.0), [0], id="a wall hides what is behind it"),
+        pytest.param(ROOMS, BOUNDS, (1.0, 9.0), [2], id="beside the end of a wall"),
+        pytest.param(LOW, BOUNDS, (1.0, 2.0), [0, 1, 2], id="a wall below the ceiling hides nothing"),
+        pytest.param(
+            ROOMS, [(1.0, 4.0, 2.0, 6.0), (5.5, 4.0, 7.0, 6.0)], (8.0, 5.0), [1], id="behind the eye only if very near"
+        ),
+    ],
+)
+def test_visible_pieces(
+    scene: Scene, bounds: list[tuple[float, ...]], eye: tuple[float, float], visible: list[int]
+) -> None:
+    visibility = Visibility(scene, bounds)
+    assert sorted(visibility.pieces(visibility.sight(np.array(eye), EAST, 1.2))) == visible
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def test_a_hospitals_picture_is_the_same_with_and_without_what_walls_hide(
     x, y = (float(v) for v in rng.uniform(scene.floor_min_m, scene.floor_max_m))
     state = _state(scene, x, y, float(rng.uniform(-pi, pi)), 30)
     picture = world.render(state, 320, 180)
-    monkeypatch.setattr(world, "_sight", lambda *_: None)
+    monkeypatch.setattr(Sight, "sees", lambda _, low, high: (np.ones(len(low), dtype=bool), np.zeros(len(low))))
     whole = world.render(state, 320, 180)
     # A person's elbow in the last column, or two surfaces in one plane, drawn in another order.
     differing = np.abs(picture.astype(int) - whole.astype(int)).max(axis=2) > 16
@@ -81,5 +81,4 @@ def test_a_picture_does_not_depend_on_what_was_drawn_before(hospital: tuple[Came
     first = world.render(states[0], 128, 128, 16 / 9)
     for state in states:
         world.render(state, 128, 128, 16 / 9)
-        world.look(state, (5.0, 5.0, 2.0), (6.0, 6.0, 0.0), 64, 36)
     assert np.array_equal(world.render(states[0], 128, 128, 16 / 9), first)

@@ -1,4 +1,4 @@
-"""A leg while a runner drives: what becomes of a task that the runner does not take at once. On a clock of its own."""
+"""A leg while a runner drives, on a clock of its own and without processes."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ import pytest
 
 from edge.run.say import SayError
 from sim_hil.realtime.stack import StackOptions
-from sim_hil.realtime.truth import TruePose
-from sim_hil.soak.drive import leg as soak_leg
-from sim_hil.soak.drive.journey import SoakTask
-from sim_hil.soak.drive.leg import Leg, LegOptions
+from sim_hil.realtime.truth import TruePose, read_lines
+from sim_hil.soak import leg as soak_leg
+from sim_hil.soak.leg import EVENTS, Leg, LegOptions
+from sim_hil.soak.tasks import SoakTask
 
 S = 1_000_000_000
 TASK = SoakTask(1, "go on", (0.0, 0.0, 0.0), (9.0, 9.0), "door 1", 12.7, 3.0)
 
 
 class Clock:
-    """Stands in for `time`: a sleep takes no time but this clock's."""
+    """Replacement of the module `time`: a sleep advances only this clock."""
 
-    now_ns = 0
+    now_ns = S
 
     def monotonic_ns(self) -> int:
         return self.now_ns
@@ -32,32 +32,38 @@ class Clock:
         self.now_ns += round(seconds * S)
 
 
-def test_a_runner_that_is_too_busy_to_answer_is_told_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    clock, tries, noted = Clock(), [], []
+def test_an_instruction_is_sent_again_to_a_runner_too_busy_to_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock, sent_ns = Clock(), list[int]()
 
     def say(_path: Path, _instruction: str) -> str:
-        tries.append(clock.now_ns)
-        if len(tries) <= 3:
+        sent_ns.append(clock.now_ns)
+        if len(sent_ns) <= 3:
             raise SayError("no answer")
         return "accepted"
 
-    stack: Any = SimpleNamespace(
-        runner=SimpleNamespace(running=True), bridge=SimpleNamespace(running=True), robot=SimpleNamespace(running=True),
-        trace=tmp_path / "t", instructions=tmp_path / "say", runs=1, processes=dict,
-    )  # fmt: skip
+    def nothing(*_: object) -> int:
+        return 0
+
+    calls = ("start_robot", "start_bridge", "start_runner", "end", "__exit__")
+    running = {name: SimpleNamespace(running=True) for name in ("robot", "bridge", "runner")}
+    values: dict[str, Any] = {"trace": tmp_path / "t", "instructions": tmp_path / "say", "runs": 1}
+    stack = type("Stack", (), {**dict.fromkeys(calls, nothing), "__enter__": nothing, "armed": lambda _: True})()
+    for name, value in {**running, **values, "processes": dict}.items():
+        setattr(stack, name, value)
+    pose = TruePose(0, 0, 0, 0, ())
+    truth = SimpleNamespace(newest=pose, update=lambda: [TruePose(clock.now_ns, 0, 0, 0, ())])
     monkeypatch.setattr(soak_leg, "time", clock)
     monkeypatch.setattr(soak_leg, "say", say)
-    monkeypatch.setattr(soak_leg, "Stack", lambda *_: stack)
-    options = StackOptions(tmp_path, tmp_path, "office", (0.0, 0.0, 0.0), 0, 0, 1)
+    monkeypatch.setattr(soak_leg, "Stack", lambda _: stack)
+    monkeypatch.setattr(soak_leg, "TruthTail", lambda _: truth)
+    options = LegOptions(1, 0, 15.0, 0.8, StackOptions(tmp_path, tmp_path, "office", (0.0, 0.0, 0.0), 0, 0, 1))
     journey: Any = SimpleNamespace(next=lambda _at: TASK)
-    leg = Leg(LegOptions(1, 0, 15.0, 0.8, options), journey, None, stopped=lambda: False, show_status=lambda _: None)
-    leg._truth = SimpleNamespace(  # type: ignore[assignment]
-        newest=TruePose(0, 0, 0, 0, ()), update=lambda: [TruePose(clock.now_ns, 0, 0, 0, ())]
-    )
-    leg._events, leg._samples = SimpleNamespace(add=noted.append), SimpleNamespace(add=lambda _: None)  # type: ignore[assignment]
-    leg._driven_ns = 0
-    leg._begin_task(TASK)
-    assert leg._drive() == "duration"
-    kinds = [event["kind"] for event in noted]
+    leg = Leg(options, journey, None, stopped=lambda: False, show_status=lambda _: None)
+
+    assert leg.run() == "duration"
+
+    kinds = [event["kind"] for event in read_lines(tmp_path / EVENTS) if event["kind"].startswith(("task", "not"))]
     assert kinds[:6] == ["task_begin", "task_end", "not_told", "not_told", "not_told", "task_begin"]
-    assert all(b - a >= S for a, b in itertools.pairwise(tries[:4]))
+    assert all(b - a >= S for a, b in itertools.pairwise(sent_ns[:4]))

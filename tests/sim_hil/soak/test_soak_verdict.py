@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from sim_hil.soak import cli
-from sim_hil.soak.drive.schedule import SoakInputError
+from sim_hil.soak.faults import SoakInputError
 from sim_hil.soak.report import write_report
-from sim_hil.soak.run import SoakFolder, SoakOptions, soak_result, verdict
-from sim_hil.soak.verdict import budget
-from sim_hil.soak.verdict.budget import FAIL, PASS, UNDECIDED, BudgetLine, Measure, judge, judge_line, load_budget
-from sim_hil.soak.verdict.measures import measures, names
-from sim_hil.soak.verdict.slopes import slope
+from sim_hil.soak.run import SoakFolder, SoakOptions, soak_result
+from sim_hil.soak.verdict import (
+    DEFAULT_BUDGET,
+    FAIL,
+    PASS,
+    UNDECIDED,
+    BudgetLine,
+    Measure,
+    applicable,
+    judge,
+    load_budget,
+    measures,
+    slope,
+)  # fmt: skip
 
 LIMIT = BudgetLine("x", "here", max=1.0)
 
@@ -31,7 +39,7 @@ def test_a_steady_growth_is_found_per_hour() -> None:
     assert found is not None and found.per_h == pytest.approx(12.0, abs=1e-6)
 
 
-def test_what_does_not_grow_has_an_interval_around_zero() -> None:
+def test_a_constant_value_has_an_interval_around_zero() -> None:
     found = slope(*grown(0.0, noise=0.5))
     assert found is not None and found.low <= 0.0 <= found.high
 
@@ -54,85 +62,52 @@ def test_a_short_life_has_no_slope() -> None:
 
 
 def test_within_the_limit_passes_and_beyond_it_fails() -> None:
-    assert judge_line(LIMIT, Measure(1.0, "", 5)).verdict == PASS
-    assert judge_line(LIMIT, Measure(1.1, "", 5)).verdict == FAIL
+    assert judge(LIMIT, Measure(1.0, "", 5))["verdict"] == PASS
+    assert judge(LIMIT, Measure(1.1, "", 5))["verdict"] == FAIL
 
 
 def test_a_lower_limit_is_one_too() -> None:
     line = BudgetLine("x", "here", min=0.98)
-    assert judge_line(line, Measure(0.99, "", 1)).verdict == PASS
-    assert judge_line(line, Measure(0.97, "", 1)).verdict == FAIL
+    assert judge(line, Measure(0.99, "", 1))["verdict"] == PASS
+    assert judge(line, Measure(0.97, "", 1))["verdict"] == FAIL
 
 
 def test_growth_whose_interval_reaches_the_limit_is_undecided() -> None:
-    assert judge_line(LIMIT, Measure(2.0, "", 1, low=0.5, high=3.0)).verdict == UNDECIDED
-    assert judge_line(LIMIT, Measure(2.0, "", 1, low=1.5, high=3.0)).verdict == FAIL
+    assert judge(LIMIT, Measure(2.0, "", 1, low=0.5, high=3.0))["verdict"] == UNDECIDED
+    assert judge(LIMIT, Measure(2.0, "", 1, low=1.5, high=3.0))["verdict"] == FAIL
 
 
-def test_what_was_not_measured_is_undecided_and_says_why() -> None:
-    found = judge_line(LIMIT, Measure(None, "", 0, note="too short"))
-    assert (found.verdict, found.why) == (UNDECIDED, "too short")
+def test_an_unmeasured_line_is_undecided_with_a_reason() -> None:
+    found = judge(LIMIT, Measure(None, "", 0, note="too short"))
+    assert (found["verdict"], found["why"]) == (UNDECIDED, "too short")
 
 
-def test_a_line_about_nothing_is_refused() -> None:
+def test_a_budget_line_about_an_unknown_measure_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "budget.toml"
+    path.write_text('format = 1\n[[budget]]\nmeasure = "y"\nsource = "here"\nmax = 1.0\n', encoding="utf-8")
     with pytest.raises(SoakInputError, match="no measure 'y'"):
-        judge([BudgetLine("y", "here", max=1.0)], {"x": Measure(1.0, "", 1)})
-
-
-def test_every_line_of_the_default_budget_is_measured() -> None:
-    lines = load_budget(budget.DEFAULT)
-    budget.check_names(lines, names())
-    assert {line.measure for line in lines} >= {"memory_slope_mib_per_h.edge-run", "bridge_jitter_ms.p999"}
-
-
-def test_a_soak_without_anything_fails_in_no_line() -> None:
-    assert all(found.verdict != FAIL for found in judge(load_budget(budget.DEFAULT), measures([], [])))
-
-
-def test_a_soak_without_anything_is_undecided_in_every_line() -> None:
-    found = judge(load_budget(budget.DEFAULT), measures([], []))
-    assert {line.verdict for line in found} == {UNDECIDED}
-    assert verdict(found) == UNDECIDED
-
-
-def test_one_line_without_data_makes_the_soak_undecided() -> None:
-    passed = judge_line(LIMIT, Measure(0.5, "", 5))
-    nothing = judge_line(LIMIT, Measure(None, "", 0))
-    failed = judge_line(LIMIT, Measure(2.0, "", 5))
-    assert verdict([passed]) == PASS
-    assert verdict([passed, nothing]) == UNDECIDED
-    assert verdict([passed, nothing, failed]) == FAIL
-
-
-def test_a_budget_without_lines_decides_nothing() -> None:
-    assert verdict([]) == UNDECIDED
+        load_budget(path)
 
 
 def test_a_soak_without_faults_is_not_judged_by_the_answers_to_them() -> None:
-    lines = load_budget(budget.DEFAULT)
-    left = budget.applicable(lines, faults=False)
+    lines = load_budget(DEFAULT_BUDGET)
+    left = applicable(lines, faults=False)
     assert {line.measure for line in lines} - {line.measure for line in left} == {"faults_unanswered"}
-    assert budget.applicable(lines, faults=True) == lines
+    assert applicable(lines, faults=True) == lines
 
 
-def empty_soak(tmp_path: Path) -> tuple[int, dict[str, Any], str]:
-    """A soak whose legs ended before anything was measured: exit code, result and page."""
+def test_a_soak_without_measurements_is_undecided_with_exit_code_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     options = SoakOptions(
         tmp_path, "0" * 64, True, ("hospital",), 0, 0, 60.0, 60.0, 0.8, None, "async", "0", "none", 0, "default"
     )
     soak = SoakFolder.create(tmp_path / "out", options)
-    result = soak_result(soak, options, load_budget(budget.DEFAULT), finished=True)
-    return cli.exit_code(result), result, write_report(soak, result).read_text(encoding="utf-8")
-
-
-def test_an_empty_soak_is_undecided_with_exit_code_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, result, _ = empty_soak(tmp_path)
-    assert (code, result["verdict"]) == (1, UNDECIDED)
+    result = soak_result(soak, options, load_budget(DEFAULT_BUDGET), finished=True)
+    assert {line["verdict"] for line in result["budget"]} == {UNDECIDED} == {result["verdict"]}
+    assert cli.exit_code(result) == 1
     assert "no data: memory_slope_mib_per_h.edge-run, " in capsys.readouterr().err
-
-
-def test_the_page_of_an_empty_soak_says_undecided(tmp_path: Path) -> None:
-    page = empty_soak(tmp_path)[2]
+    page = write_report(soak, result).read_text(encoding="utf-8")
     assert '<span class="verdict bad">UNDECIDED</span>' in page
     assert "no verdict: 12 of 12 budget lines are undecided" in page
 
@@ -140,7 +115,7 @@ def test_the_page_of_an_empty_soak_says_undecided(tmp_path: Path) -> None:
 @pytest.mark.parametrize("lines", ["max = 1.0\nmin = 0.0", "", "max = nan", "most = 1.0"])
 def test_a_budget_that_is_wrong_is_refused(tmp_path: Path, lines: str) -> None:
     path = tmp_path / "budget.toml"
-    path.write_text(f'format = 1\n[[budget]]\nmeasure = "x"\nsource = "here"\n{lines}\n', encoding="utf-8")
+    path.write_text(f'format = 1\n[[budget]]\nmeasure = "stops"\nsource = "here"\n{lines}\n', encoding="utf-8")
     with pytest.raises(SoakInputError):
         load_budget(path)
 
@@ -153,9 +128,10 @@ def sample(t: float, rss_mib: float, pid: int = 7) -> dict[str, object]:
 def test_a_runner_that_leaks_fails_and_one_that_does_not_passes() -> None:
     for growth, wanted in ((3.0, FAIL), (0.1, PASS)):
         leg = [sample(float(t), 250 + growth * t / 3600) for t in range(1200)]
-        found = {j.line.measure: j for j in judge(load_budget(budget.DEFAULT), measures([], [leg]))}
-        assert found["memory_slope_mib_per_h.edge-run"].verdict == wanted
-        assert found["descriptor_slope_per_h.edge-run"].verdict == PASS
+        lines = {line.measure: line for line in load_budget(DEFAULT_BUDGET)}
+        found = measures([], [leg])
+        for name, verdict in (("memory_slope_mib_per_h.edge-run", wanted), ("descriptor_slope_per_h.edge-run", PASS)):
+            assert judge(lines[name], found[name])["verdict"] == verdict
 
 
 def test_every_process_has_a_life_of_its_own() -> None:

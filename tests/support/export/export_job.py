@@ -11,8 +11,8 @@ from export.evaluation.calibration import load_calibration
 from export.model.config import PRESETS
 from export.pipeline.build import build_stages
 from export.pipeline.job import Job, WeightSource
-from export.target.file import load_target
-from reporting.build_progress import Progress
+from export.targets.file import load_target
+from reporting.progress import BuildProgress
 
 NANO = PRESETS["nano"]
 TARGET = load_target("cpu", "nano")
@@ -23,9 +23,9 @@ def job(seed: int = 0) -> Job:
     return Job(TARGET, WeightSource(NANO, [], seed), load_calibration(DEFAULT_CALIBRATION))
 
 
-def progress() -> Progress:
+def progress() -> BuildProgress:
     """Its progress, on standard error."""
-    return Progress("test", build_stages(job(), {}))
+    return BuildProgress("test", build_stages(job(), {}))
 
 
 def manifest(directory: Path) -> dict[str, Any]:

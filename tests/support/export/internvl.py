@@ -12,8 +12,10 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from export.checkpoint import CheckpointError, load_checkpoint
+from export.checkpoint.load import load_checkpoint
 from export.model.config import ActionConfig, LanguageConfig, TicVlaConfig, VisionConfig
+from export.model.weights import CheckpointError
+from tools.bench.parity_1b import internvl_config
 
 CONFIG = TicVlaConfig(
     name="small",
@@ -40,34 +42,9 @@ CONFIG = TicVlaConfig(
 def hf_model(tied: bool = False) -> Any:
     """The same network by transformers; every weight, bias and norm is random."""
     # Imported here: it takes seconds, and every worker imports this module to collect its tests.
-    from transformers import InternVLConfig, InternVLForConditionalGeneration
+    from transformers import InternVLForConditionalGeneration
 
-    vision, language = CONFIG.vision, CONFIG.language
-    config = InternVLConfig(
-        vision_config={
-            "hidden_size": vision.hidden,
-            "num_hidden_layers": vision.layers,
-            "num_attention_heads": vision.heads,
-            "intermediate_size": vision.mlp,
-            "image_size": [vision.image_px, vision.image_px],
-            "attention_bias": True,
-            "use_absolute_position_embeddings": True,
-        },
-        text_config={
-            "model_type": "qwen2",
-            "hidden_size": language.hidden,
-            "num_hidden_layers": language.layers,
-            "num_attention_heads": language.heads,
-            "num_key_value_heads": language.kv_heads,
-            "intermediate_size": language.mlp,
-            "vocab_size": language.vocab,
-            "rope_parameters": {"rope_theta": language.rope_theta, "rope_type": "dynamic", "factor": 2.0},
-            "tie_word_embeddings": tied,
-        },
-        image_token_id=language.img_context_id,
-        image_seq_length=CONFIG.vision.tokens,
-        tie_word_embeddings=tied,
-    )
+    config = internvl_config(CONFIG, tied=tied)
     model = InternVLForConditionalGeneration(config).eval()
     generator = torch.Generator().manual_seed(5)
     with torch.no_grad():

@@ -32,7 +32,7 @@ def main() -> int:
         sys.stderr.write("ready\n")
         while True:
             link.receive()
-            link.tell(BridgeStatus(time.monotonic_ns(), "armed", "believe me", 0, 0, 0, zero, False))
+            link.send_status(BridgeStatus(time.monotonic_ns(), "armed", "believe me", 0, 0, 0, zero, False))
             time.sleep(0.01)
     try:
         BridgeClient(arguments[0]).close()

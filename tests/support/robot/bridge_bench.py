@@ -7,10 +7,10 @@ from pathlib import Path
 
 from firmware_bridge.core.config import BridgeConfig, LimitsConfig, SafetyConfig
 from firmware_bridge.core.link import Arm, BridgeStatus, Velocity
+from firmware_bridge.core.robot_state import RobotState
 from firmware_bridge.core.rules import BridgeCore
 from firmware_bridge.core.step_types import Call, Inputs, Move, Outputs, Report
 from firmware_bridge.unitree.messages import ids
-from firmware_bridge.unitree.messages.state import RobotState
 
 MS = 1_000_000
 BRIDGE = BridgeConfig(Path("/nowhere/bridge.sock"))
@@ -51,17 +51,17 @@ class Bench:
         self.asked = False
 
     def step(
-        self, *messages: object, shutdown: bool = False, operator: tuple[object, ...] = (), **heard: object
+        self, *messages: object, shutdown: bool = False, operator: tuple[object, ...] = (), **reported: object
     ) -> Outputs:
-        """One step; `heard`: what else came over the robot's network (fields of Report)."""
+        """One step; `reported`: what else came over the robot's network (fields of Report)."""
         if self.mode is not None:
             state = replace(STILL, received_ns=self.now_ns, mode=self.mode, **self.robot)
-            heard = {"state": state, **heard}
-        heard = {"battery_percent": self.battery, **heard}
-        self.battery = heard["battery_percent"]  # type: ignore[assignment]
+            reported = {"state": state, **reported}
+        reported = {"battery_percent": self.battery, **reported}
+        self.battery = reported["battery_percent"]  # type: ignore[assignment]
         if self.asked:
-            heard = {"version": self.version, **heard}
-        inputs = Inputs(messages, self.client, Report(**heard), operator, self.estop, self.asleep_ns, shutdown)
+            reported = {"version": self.version, **reported}
+        inputs = Inputs(messages, self.client, Report(**reported), operator, self.estop, self.asleep_ns, shutdown)
         outputs = self.core.step(inputs, self.now_ns)
         asked = Call(ids.API_VERSION)
         self.asked = asked in outputs.requests

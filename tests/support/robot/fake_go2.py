@@ -1,4 +1,4 @@
-"""A robot at the wire, nothing behind it: answers the sport service, reports its mode, notes what it hears."""
+"""A robot at the wire, nothing behind it: answers the sport service, reports its mode, notes what it receives."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from firmware_bridge.unitree.dds import Bus
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.messages.idl import SportModeState_, WirelessController_
 from firmware_bridge.unitree.messages.idl_low import LowState_
-from sim_hil.protocols.unitree.services.leases import APPLY, ERROR_DENIED, RENEW, Lease
-from sim_hil.protocols.unitree.services.service import LeaseServer, ServiceServer
+from sim_hil.protocols.unitree.odometry import OdometryFrame
+from sim_hil.protocols.unitree.services.service import APPLY, ERROR_DENIED, RENEW, Lease, LeaseServer, ServiceServer
 from sim_hil.protocols.unitree.services.sport import handle_sport, parse_move
-from sim_hil.protocols.unitree.state import LowStateMessage, OdometryFrame, sport_mode_state
+from sim_hil.protocols.unitree.state import LowStateMessage, sport_mode_state
 from sim_hil.robots.go2.body import RobotTruth
 from sim_hil.robots.go2.sport import SportAction
 
@@ -46,13 +46,13 @@ class FakeGo2:
     """Serves in a thread of its own until `close`.
 
     `reporting = False` makes it fall silent; `truth` changes what it reports (fields of RobotTruth); `remote` is what
-    its remote sends: lx, ly, rx, ry, keys; requests in `unanswered` are heard and never answered. With `walks` it moves
+    its remote sends: lx, ly, rx, ry, keys; requests in `unanswered` are noted and never answered. With `walks` it moves
     as commanded and reports that. Another client that holds `lease` shuts everybody else out.
     """
 
     def __init__(self, domain: int, bus: Bus | None = None) -> None:
         """`bus`: participant to use, by default one of its own."""
-        self.heard: list[ReceivedCommand] = []
+        self.received: list[ReceivedCommand] = []
         self.lease = Lease()
         self.reset()
         self.bus = Bus(DdsConfig(domain, "lo", ("127.0.0.1",))) if bus is None else bus
@@ -90,17 +90,17 @@ class FakeGo2:
         return [point for point in list(self.track) if point[0] >= since_ns]
 
     def reset(self) -> None:
-        """Lie down, behave, and forget what was heard."""
+        """Lie down, behave, and forget what was received."""
         self.mode, self.reporting, self.truth, self.version = ids.MODE_LIE_DOWN, True, {}, ids.SERVICE_VERSION
         self.remote, self.unanswered = (0.0, 0.0, 0.0, 0.0, 0), set()
         self.walks, self.speed_mps = False, 0.0
         self._other_holds = False
         self._target_mps, self._move_ns, self._other_mps = 0.0, 0, None
         self.track: deque[tuple[int, float, float]] = deque(maxlen=20_000)
-        self.heard.clear()
+        self.received.clear()
 
     def moves(self) -> list[ReceivedCommand]:
-        return [heard for heard in list(self.heard) if heard.api_id == ids.MOVE]
+        return [command for command in list(self.received) if command.api_id == ids.MOVE]
 
     def is_driven(self) -> bool:
         """Whether the newest Move is not zero."""
@@ -118,7 +118,7 @@ class FakeGo2:
             self._waitset.wait(5_000_000)
             for request in self._server.requests():
                 velocity = parse_move(request.parameter) if request.api_id == ids.MOVE else None
-                self.heard.append(ReceivedCommand(request.received_ns, request.api_id, velocity))
+                self.received.append(ReceivedCommand(request.received_ns, request.api_id, velocity))
                 if request.api_id == ids.API_VERSION:
                     self._server.reply(request, ids.OK, self.version)
                 elif self.lease.denies(request.lease_id, request.received_ns):

@@ -9,7 +9,7 @@ from edge.core.geometry import SE2
 from sim_hil.protocols.unitree.services.avoidance import RANGE_M, ObstaclesAvoid, Pilot
 from sim_hil.protocols.unitree.services.behaviour import Go2Behaviour
 from sim_hil.protocols.unitree.services.postures import STANDING
-from sim_hil.protocols.unitree.services.sport_service import SportService
+from sim_hil.protocols.unitree.services.sport import SportService
 from sim_hil.protocols.unitree.services.switching import MotionSwitcher, RobotState
 from sim_hil.robots.go2.body import Go2
 from sim_hil.robots.go2.gait import BodyMotion

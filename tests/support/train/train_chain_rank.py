@@ -16,11 +16,11 @@ from unittest.mock import patch
 import torch
 
 from tools.train import cli
+from tools.train.config.checks import TrainError
 from tools.train.pipeline import chain
 from tools.train.pipeline.chain import Step
 from tools.train.run.distributed import leave
 from tools.train.run.job import StageJob
-from tools.train.run.run_dir import RunDirError
 
 
 def main() -> int:
@@ -32,9 +32,9 @@ def main() -> int:
         with (out / f"{here}.txt").open("a", encoding="utf-8") as file:
             file.write(f"{name} {job.ranks.rank}/{job.ranks.world} {torch.get_num_threads()}\n")
         if name == how:
-            raise RunDirError(f"{name} has failed")
+            raise TrainError(f"{name} has failed")
         if how == "stop" and name == "encoder" and here == "1":
-            job.stop.ask()
+            job.stop.asked = True
         job.ranks.barrier()
         return {"stage": name}
 
@@ -44,7 +44,8 @@ def main() -> int:
     def round_of(job: StageJob, step: Step) -> dict[str, Any]:
         return note(step.stage, job)
 
-    with patch.object(chain, "module_run", stage), patch.object(chain, "_round", round_of):
+    stages = {name: stage(name) for name in chain.RUNS}
+    with patch.dict(chain.RUNS, stages), patch.object(chain, "_round", round_of):
         return cli.main(["all", "--preset", "tiny", "--set", "dagger.rounds=1", "--out", str(out / "run"), "--resume"])
 
 

@@ -1,4 +1,4 @@
-"""Recorded drives as training's tests need them: made up, small, and with answers that depend on what is seen."""
+"""Made-up recorded drives: small, with answers that depend on what is seen, or an arc with a number in each image."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from edge.state.reasoning_text import Progress
 from export.model.config import PRESETS, TicVlaConfig
 from tools.train.config.collect import TRACE_EVERY
 from tools.train.drives.dataset import DatasetWriter
-from tools.train.drives.drive import EXPERT, PICTURE_PX, About, Dataset, Drive, Entry
+from tools.train.drives.drive import EXPERT, FUTURE_STEPS, PICTURE_PX, About, Dataset, Drive, Entry
+from tools.train.drives.futures import label_futures, relative
 
 WORDINGS = ("Turn left, then stop at the desk.", "Take the first left and wait at the desk.")
 VAL_LAYOUT = 106
@@ -119,3 +121,66 @@ class MadeUpTokens:
     def frames(self, drive_id: str) -> np.ndarray:
         """The same for every drive."""
         return self._tokens
+
+
+TURN_RADPS, SPEED_MPS = 0.2, 0.8
+
+
+def about(name: str = "a", frames: int = 60, **changed: Any) -> About:
+    """What holds for a made-up drive; a trace a second."""
+    aspects = {"situation": "in a corridor", "objects": "none", "motion": "nobody near"}
+    aspects["plan"] = "turn left into the room now"
+    ks = range(0, frames, TRACE_EVERY)
+    traces = tuple({"k": k, **aspects, "progress": {"step": 1, "steps": 1, "passed": k // 20}} for k in ks)
+    values: dict[str, Any] = {
+        "id": name, "kind": "office", "layout_seed": 100, "scene": "office-100", "robot": "go2", "people": 3, "seed": 7,
+        "driver": "expert", "drift": "none", "goal_xy": (4.0, 0.0), "threshold_m": 1.5, "outcome": "reached",
+        "collided": False, "wordings": tuple(f"turn left at door {i}" for i in range(8)), "told": (), "traces": traces,
+    }  # fmt: skip
+    return About(**{**values, **changed})
+
+
+def arc(frames: int, start: tuple[float, float, float] = (1.0, 2.0, 0.5)) -> NDArray[np.float64]:
+    """[n, 3]: poses 0.1 s apart on an arc from `start`, at SPEED_MPS and TURN_RADPS."""
+    x, y, heading = start
+    radius = SPEED_MPS / TURN_RADPS
+    turned = heading + TURN_RADPS * np.arange(frames) / 10
+    return np.stack(
+        (x + radius * (np.sin(turned) - sin(heading)), y - radius * (np.cos(turned) - cos(heading)), turned), axis=1
+    )
+
+
+def drive(name: str = "a", frames: int = 60, pose: NDArray[np.float64] | None = None, **changed: Any) -> Drive:
+    """A drive along poses; odometry begins at zero and is 1 % long; `changed` is of `about`."""
+    poses = arc(frames) if pose is None else pose
+    odometry = relative(poses[0], poses)
+    odometry[:, :2] *= 1.01
+    jpegs = [_jpeg(k) for k in range(frames)]
+    future, steps = label_futures(poses, np.zeros((frames, FUTURE_STEPS, 3)), np.full(frames, EXPERT), goes_on=False)
+    return Drive(
+        about=about(name, frames, **changed),
+        jpeg=np.concatenate(jpegs),
+        jpeg_end=np.cumsum([len(jpeg) for jpeg in jpegs]).astype(np.int64),
+        pose=poses,
+        pose_odom=odometry,
+        state=np.tile(np.array((SPEED_MPS, 0.0, TURN_RADPS), np.float32), (frames, 1)),
+        future=future.astype(np.float32),
+        future_steps=steps.astype(np.int16),
+        plan_xy=np.tile(np.array(((2.4, 0.0), (4.8, 0.0), (7.2, 0.0)), np.float32), (frames, 1, 1)),
+        by=np.full(frames, EXPERT, np.uint8),
+    )
+
+
+def _jpeg(k: int) -> NDArray[np.uint8]:
+    """A red picture as bright as its number, above a blue one."""
+    picture = np.zeros((128, 128, 3), np.uint8)
+    picture[:64, :, 0] = 60 + k % 180
+    picture[64:, :, 2] = 200
+    done, jpeg = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
+    assert done
+    return np.asarray(jpeg, np.uint8).ravel()
+
+
+def dataset(folder: Path, *drives: Drive) -> Dataset:
+    """Write a data set of drives."""
+    return write_dataset(folder, drives)

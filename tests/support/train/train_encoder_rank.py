@@ -14,8 +14,8 @@ import torch
 from safetensors.numpy import save_file
 
 from tests.support.train.train_drives import tiny_model
+from tools.train.config.checks import OptimConfig
 from tools.train.config.encoder import AugmentConfig, EncoderConfig, FramesConfig
-from tools.train.config.optim import OptimConfig
 from tools.train.config.recipe import Recipe
 from tools.train.encoder.data import Shard, finish, path_of, plan
 from tools.train.encoder.encoder import run

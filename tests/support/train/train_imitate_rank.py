@@ -16,9 +16,9 @@ from edge.state.reasoning_text import format_waypoints
 from export.model.config import TicVlaConfig
 from export.model.network import TicVla, build
 from tests.support.train.train_drives import VAL_LAYOUT, MadeUpTokens, made_up_drive, tiny_model, write_dataset
+from tools.train.config.checks import OptimConfig
 from tools.train.config.collect import TRACE_EVERY
 from tools.train.config.imitate import ImitateConfig, ImitateEvalConfig, SampleConfig
-from tools.train.config.optim import OptimConfig
 from tools.train.config.recipe import Recipe
 from tools.train.drives.drive import EXPERT, FUTURE_STEPS, Dataset, Drive
 from tools.train.drives.futures import label_futures, relative
@@ -116,7 +116,6 @@ def imitate_job(
 def trained(dataset: Dataset, job: StageJob) -> tuple[TicVla, dict[str, Any]]:
     """The network after `fit`, and its result."""
     network = build(job.recipe.model, 1)
-    assert job.recipe.imitate is not None
     policy = ActionExpertPolicy(network.action, job.recipe.imitate.loss)
     return network, fit(job, policy, dataset, MadeUpTokens(), SideStates(dataset), of="test")
 

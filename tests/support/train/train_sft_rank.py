@@ -12,7 +12,7 @@ import torch
 
 from export.model.network import TicVla, build
 from tests.support.train.train_drives import MadeUpTokens, tiny_model
-from tools.train.config.optim import OptimConfig
+from tools.train.config.checks import OptimConfig
 from tools.train.config.recipe import Recipe
 from tools.train.config.sft import DrawConfig, EvalConfig, SftConfig
 from tools.train.drives.drive import Dataset

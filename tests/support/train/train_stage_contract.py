@@ -13,6 +13,7 @@ from typing import Any, ClassVar, NamedTuple
 import pytest
 import torch
 
+from tools.train.config.checks import TrainError
 from tools.train.run.job import QuietProgress, StopFlag
 
 ROOT = Path(__file__).parents[3]
@@ -35,7 +36,7 @@ class StopAfter(QuietProgress):
 
     def update(self, done: int, total: int, **numbers: float) -> None:
         if "loss" in numbers and done == self._steps:
-            self.flag.ask()
+            self.flag.asked = True
 
 
 class DiesAt(QuietProgress):
@@ -54,7 +55,6 @@ class StageContract:
 
     rank: ClassVar[str]
     """Module that is one of two processes: `python -m MODULE [DRIVES] OUT`."""
-    error: ClassVar[type[Exception]]
     other: ClassVar[Any]
     """Numbers of another recipe."""
 
@@ -88,7 +88,7 @@ class StageContract:
         again = self.train(tmp_path, resume=True)
         assert again.lines == whole.lines and again.result == whole.result
         assert all(torch.equal(tensor, whole.weights[name]) for name, tensor in again.weights.items())
-        with pytest.raises(self.error, match="another recipe"):
+        with pytest.raises(TrainError, match="another recipe"):
             self.train(tmp_path, self.other, resume=True)
 
     @pytest.mark.slow

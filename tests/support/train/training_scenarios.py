@@ -10,12 +10,12 @@ import numpy as np
 
 from edge.core.geometry import SE2
 from tests.support.train.train_drives import made_up_drive
-from tools.train.config.scenes import KINDS
+from tools.train.config.collect import KINDS
 from tools.train.drives.drive import Drive
-from tools.train.scenes.progress_labels import RouteProgress
-from tools.train.scenes.scenarios import Scenario, scenario_group
-from tools.train.scenes.trace_sentences import NO_OBJECTS, NO_PEOPLE, aspects_json
-from tools.train.scenes.traces import Tracer
+from tools.train.drives.progress_labels import RouteProgress
+from tools.train.drives.scenarios import Scenario, scenario_group
+from tools.train.drives.trace_sentences import NO_OBJECTS, NO_PEOPLE, aspects_json
+from tools.train.drives.traces import Tracer
 
 SEED = 5
 SPEED_MPS = 0.8

@@ -17,18 +17,9 @@ def blocks(*medians_ms: float, first: int = 0) -> list[Tick]:
     ]
 
 
-def test_blocks_alternate() -> None:
-    assert [allowed(number * BLOCK_NS) for number in range(4)] == [True, False, True, False]
-
-
 @pytest.mark.parametrize(("first", "expected"), [(0, [1.5, 1.5]), (1, [1 / 1.5, 1 / 1.5])])
 def test_a_ratio_is_of_neighbours_with_reasoning_over_without(first: int, expected: list[float]) -> None:
     assert block_ratios(blocks(15.0, 10.0, 15.0, first=first)) == pytest.approx(expected)
-
-
-def test_a_quiet_run_passes() -> None:
-    result = summarise(blocks(11.0, 10.0), missed=0, generations=5, busy=0.9)
-    assert result["ok"] and result["ratio"] == pytest.approx(1.1)
 
 
 @pytest.mark.parametrize(

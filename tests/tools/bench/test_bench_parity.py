@@ -41,11 +41,6 @@ def test_tokens_count_up_to_the_first_that_differs() -> None:
     assert rows["greedy tokens identical"] == {"value": 2, "bound": 6, "kept": False}
 
 
-def test_a_graph_gives_the_last_positions_logits_alone() -> None:
-    theirs = outputs()
-    assert missed(theirs, theirs | {"logits": theirs["logits"][-1:]}) == []
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("arguments", [["--frames", "0"], ["--frames", "9"], ["--model", "7b"], ["--json", "/"]])
 def test_bad_arguments_are_refused_before_anything_is_built(arguments: list[str]) -> None:

@@ -65,10 +65,12 @@ class Workload:
         shape = (1, self.semantic_tokens, self.config.kv_dim)
         return np.random.default_rng(SEED + 1).standard_normal(shape).astype(np.float32)
 
-    def state(self) -> npt.NDArray[np.float32]:
-        """Robot state [1, 3]."""
-        return np.array([[0.4, 0.0, 0.0]], dtype=np.float32)
-
-    def latency(self) -> npt.NDArray[np.float32]:
-        """Δt, Δx, Δy, Δθ [1, 4]."""
-        return np.array([[2.0, 0.0, 0.0, 0.0]], dtype=np.float32)
+    def action_inputs(self) -> dict[str, npt.NDArray[np.float32]]:
+        """Inputs of the unsplit action expert in their order; latency is Δt, Δx, Δy, Δθ."""
+        shape = (1, self.config.vision.tokens, self.config.vision.token_dim)
+        return {
+            "visual_tokens": np.random.default_rng(2).standard_normal(shape).astype(np.float32),
+            "state": np.array([[0.4, 0.0, 0.0]], dtype=np.float32),
+            "latency": np.array([[2.0, 0.0, 0.0, 0.0]], dtype=np.float32),
+            "last_layer_kv": self.last_layer_kv(),
+        }

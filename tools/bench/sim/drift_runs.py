@@ -167,7 +167,7 @@ def _record(
         samples.append(sample)
         if time_s >= STAND_S:
             command = pilot.command(pose, time_s)
-            simulation.move(*command)
+            simulation.command(*command)
         if sample.stamp_ns % FRAME_NS < STATE_NS:
             frames += 1
             picture = world.render(simulation.render_state(), *SIZE_PX)

@@ -8,10 +8,8 @@ from pathlib import Path
 import pybullet
 
 from sim_hil.robots.carter.body import Carter, CarterTruth
-from sim_hil.robots.carter.wheel_odometry import WheelCalibration
-from sim_hil.robots.go2.gait import GRAVITY_MPS2
-
-Vec3 = tuple[float, float, float]
+from sim_hil.robots.carter.drive import WheelCalibration
+from tools.bench.sim.locomotion_runs import Vec3, add_box, open_physics
 
 
 class World:
@@ -19,23 +17,14 @@ class World:
 
     def __init__(self, folder: Path, rate_hz: int = 240, calibration: WheelCalibration | None = None) -> None:
         """`folder`: for files that are read while building only."""
-        self.client = pybullet.connect(pybullet.DIRECT)
-        self.dt_s = 1.0 / rate_hz
-        pybullet.setPhysicsEngineParameter(
-            fixedTimeStep=self.dt_s, numSubSteps=1, deterministicOverlappingPairs=1, physicsClientId=self.client
-        )
-        pybullet.setGravity(0, 0, -GRAVITY_MPS2, physicsClientId=self.client)
+        self.client, self.dt_s = open_physics(rate_hz), 1.0 / rate_hz
         self.box((0, 0, -0.5), (60, 60, 1))
         self.robot = Carter(self.client, folder, (0.0, 0.0, 0.0), self.dt_s, calibration=calibration)
         self.steps = 0
 
     def box(self, centre: Vec3, size: Vec3, pitch_rad: float = 0.0, grip: float = 0.9) -> None:
         """Something solid; `pitch_rad` turns it about y."""
-        half = [extent / 2 for extent in size]
-        shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, physicsClientId=self.client)
-        turn = pybullet.getQuaternionFromEuler((0, pitch_rad, 0))
-        body = pybullet.createMultiBody(0, shape, -1, centre, turn, physicsClientId=self.client)
-        pybullet.changeDynamics(body, -1, lateralFriction=grip, physicsClientId=self.client)
+        add_box(self.client, centre, size, pitch_rad, grip)
 
     def ramp(self, start_x: float, degrees: float, length_m: float) -> None:
         """Rises along x from the floor at `start_x`."""

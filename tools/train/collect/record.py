@@ -16,8 +16,7 @@ from sim_hil.benchmark.env.world import EpisodeWorld, WorldOptions
 from sim_hil.benchmark.policies.expert import ExpertPolicy
 from sim_hil.benchmark.suite.episode import Episode
 from sim_hil.scene.scene import Scene
-from tools.train.collect.detour import Detour, DetourDriver
-from tools.train.collect.steering import Velocity
+from tools.train.collect.steering import Detour, DetourDriver, Velocity
 from tools.train.config.collect import RATE_HZ, TRACE_EVERY
 from tools.train.drives.drive import NOISE, PICTURE_PX, PLAN_TIMES_S
 from tools.train.drives.futures import chosen_future, label_futures

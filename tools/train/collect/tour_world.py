@@ -27,16 +27,15 @@ from sim_hil.benchmark.suite.robots import footprint_m, max_step_m
 from sim_hil.crowd.people import UPDATE_HZ, People
 from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.simulation.camera import CameraWorld
-from tools.train.collect.detour import DetourProgress, draw_detour
 from tools.train.collect.record import CameraSettings, NothingToLearnError, Recorded
+from tools.train.collect.steering import DetourProgress, draw_detour
 from tools.train.config.collect import RATE_HZ, TRACE_EVERY, CollectConfig, TourConfig
 from tools.train.drives.drive import FUTURE_STEPS, PICTURE_PX, PLAN_TIMES_S
-from tools.train.encoder.poses import body_state
+from tools.train.drives.scenarios import Scenario, Site
+from tools.train.drives.trace_sentences import aspects_json
+from tools.train.drives.traces import Tracer, turning_first
+from tools.train.encoder.worker import body_state
 from tools.train.samples.augment import encoded
-from tools.train.scenes.scenarios import Scenario
-from tools.train.scenes.sites import Site
-from tools.train.scenes.trace_sentences import aspects_json
-from tools.train.scenes.traces import Tracer, turning_first
 
 Array = NDArray[np.float64]
 Vec2 = tuple[float, float]
@@ -232,16 +231,14 @@ class _Tour:
         if not self._planner.reachable(*episode.start[:2]):
             raise NothingToLearnError("the expert finds no path")
         self._tracer = Tracer(scenario)
-        self.body = KinematicBase(SE2(*episode.start), self._paced(), site.robot_grid(episode.robot), rng)
+        paced = replace(self._driving, speed_mps=collect.speed_mps)
+        self.body = KinematicBase(SE2(*episode.start), paced, site.robot_grid(episode.robot), rng)
         self._route = np.array([episode.start[:2]])
         self._ticks, self._blocked_s = 0, 0.0
         self._left_s = self._tracer.progress.length_m / _ALLOWED_MPS + _SPARE_S
         self._detour, self._detour_route = self._drawn_detour(), self._route
         self._linger_s: float | None = None
         self.plan: list[Vec2] = []
-
-    def _paced(self) -> Driving:
-        return replace(self._driving, speed_mps=self._speed_mps)
 
     def _planner_to(self, goal: Vec2, near_m: float, described: tuple[Vec2, ...] = ()) -> RoutePlanner:
         robot = self._robot

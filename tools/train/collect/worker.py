@@ -9,7 +9,6 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,32 +17,28 @@ from numpy.typing import NDArray
 
 from edge.artifacts.files import ArtifactError
 from edge.reasoning.prompt import InstructionError
-from export.core.typed import build, plain
+from export.core.typed import build
 from sim_hil.benchmark.env.observation import Observation
 from sim_hil.benchmark.env.world import EpisodeWorld
 from sim_hil.benchmark.policies.expert import ExpertPolicy
 from sim_hil.benchmark.workers.worker_process import worker_main
 from sim_hil.processes.child_process import Message
 from sim_hil.scene.scene import SceneError
-from tools.train.collect.dagger_driver import PolicyDriver, PolicyOptions
-from tools.train.collect.detour import draw_detour
 from tools.train.collect.record import (
     CameraSettings,
     DrivePlan,
     NothingToLearnError,
     Recorded,
-    Steer,
     TraceAt,
     record,
 )
-from tools.train.collect.steering import SteeringNoise, Velocity
+from tools.train.collect.steering import PolicyDriver, PolicyOptions, SteeringNoise, Velocity, draw_detour
 from tools.train.collect.tour_world import TourWorld, record_tour
-from tools.train.config.collect import RATE_HZ, TRACE_EVERY, CollectConfig, TourConfig
-from tools.train.config.scenes import SHARES
+from tools.train.config.collect import RATE_HZ, SHARES, TRACE_EVERY, CollectConfig, TourConfig
 from tools.train.drives.drive import DRIVES, EXPERT, PICTURE_PX, TOUR_DRIVER, About, Drive, Entry
-from tools.train.scenes.scenarios import Scenario, ScenarioError, training_episodes
-from tools.train.scenes.trace_sentences import aspects_json
-from tools.train.scenes.traces import Tracer
+from tools.train.drives.scenarios import Scenario, ScenarioError, training_episodes
+from tools.train.drives.trace_sentences import aspects_json
+from tools.train.drives.traces import Tracer
 
 MODULE: Final = "tools.train.collect.worker"
 _TAG: Final = 0xC011
@@ -71,15 +66,6 @@ class Order:
     def id(self, number: int) -> str:
         """Return the id of a drive of this collection."""
         return f"{self.prefix}{number:05d}"
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the content that `of_json` reads."""
-        return dict(plain(self))
-
-    @staticmethod
-    def of_json(content: Mapping[str, object]) -> Order:
-        """Build the order that `as_json` wrote. Raises FieldError."""
-        return build(Order, content, "order")
 
 
 @dataclass(frozen=True)
@@ -114,7 +100,7 @@ def messages(job: Message) -> Iterator[Mapping[str, Any]]:
 
     `{"refused": …}` ends the order: the policy's artifacts cannot be used.
     """
-    order = Order.of_json(job)
+    order = build(Order, job, "order")
     numbers = range(order.start, order.start + order.count)
     size = order.tour.per_layout if order.tour is not None else order.config.drives_per_layout
     kinds = order.config.kinds or SHARES
@@ -179,7 +165,7 @@ def _drive(order: Order, number: int, scenario: Scenario) -> Entry:
     expert = ExpertPolicy(
         margin_m=config.margin_m,
         speed_mps=config.speed_mps,
-        told=scenario.task.path,
+        prescribed=scenario.task.path,
         patient=plan.policy_drives or detour is not None,
         rests=True,
         wall_m=config.wall_m,
@@ -188,7 +174,11 @@ def _drive(order: Order, number: int, scenario: Scenario) -> Entry:
         with PolicyDriver(order.policy, episode, rng) as policy:
             recorded, driver = record(plan, expert, policy.steer, _trace_at(scenario)), policy.name
     else:
-        steer: Steer = partial(_noisy, SteeringNoise(rng)) if draw.noise else _expert_command
+        noise = SteeringNoise(rng) if draw.noise else None
+
+        def steer(_: Observation, wanted: Velocity) -> tuple[Velocity, int]:
+            return (wanted, EXPERT) if noise is None else noise.command(wanted)
+
         recorded = record(plan, expert, steer, _trace_at(scenario))
         driver = "expert-noise" if draw.noise else "expert"
     return _saved(order, Drive(_about(scenario, order.id(number), recorded, driver, draw), **recorded.arrays))
@@ -212,14 +202,6 @@ def _saved(order: Order, drive: Drive) -> Entry:
     path = Path(order.folder) / DRIVES / f"{drive.id}.safetensors"
     drive.save(path)
     return Entry.of(drive, path)
-
-
-def _expert_command(_: Observation, wanted: Velocity) -> tuple[Velocity, int]:
-    return wanted, EXPERT
-
-
-def _noisy(noise: SteeringNoise, _: Observation, wanted: Velocity) -> tuple[Velocity, int]:
-    return noise.command(wanted)
 
 
 def _trace_at(scenario: Scenario) -> TraceAt:

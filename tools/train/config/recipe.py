@@ -1,27 +1,32 @@
-"""The recipe of a training run: network, seed and one configuration table per stage, read strictly from TOML."""
+"""The recipe of a training run: network, seed and a table per stage, read strictly from TOML; the paper's variants."""
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 from zlib import crc32
 
 import numpy as np
+import tomli_w
 
-from export.core.settings import MODEL_PREFIX, model_settings
 from export.core.typed import FieldError, build, field_types, from_text, near, plain
-from export.model.config import ModelConfigError, TicVlaConfig
-from export.model.config_file import config_for, config_from_dict, with_overrides
-from reporting.toml_text import toml_text
+from export.model.config import (
+    MODEL_PREFIX,
+    ModelConfigError,
+    TicVlaConfig,
+    config_for,
+    config_from_dict,
+    model_settings,
+    with_overrides,
+)
 from tools.train.config.collect import CollectConfig, DaggerConfig
 from tools.train.config.encoder import EncoderConfig
-from tools.train.config.evaluate import EvaluateConfig
 from tools.train.config.imitate import ImitateConfig
-from tools.train.config.rl import RlConfig
+from tools.train.config.rl import EvaluateConfig, RlConfig
 from tools.train.config.sft import SftConfig
 
 if sys.version_info >= (3, 11):
@@ -40,6 +45,35 @@ STAGES: Final[Mapping[str, type]] = {
     "evaluate": EvaluateConfig,
 }
 """Configuration class of each stage."""
+_UNAWARE: Final = ("model.action.latency_aware=false", "imitate.inject_delay=false")
+VARIANTS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
+    {
+        "full": (),
+        "waypoints": ("model.action.semantic_interface=waypoints",),
+        "waypoints-no-latency": ("model.action.semantic_interface=waypoints", *_UNAWARE),
+        "values-only": ("model.action.semantic_interface=values-only",),
+        "no-latency": _UNAWARE,
+        "no-motion-offset": ("model.action.motion_offset=false",),
+        "no-reasoning": ("imitate.sample.reasoning=false",),
+        "offsets": ("model.action.parameterisation=offsets",),
+        "horizon-1s": ("model.action.steps=10",),
+        "horizon-5s": ("model.action.steps=50",),
+        "depth-3": ("model.action.layers=3",),
+        "depth-12": ("model.action.layers=12",),
+        "diffusion": ("model.action.head=diffusion",),
+        "flow": ("model.action.head=flow",),
+        "point-goal-bc": ("imitate.policy=point-goal",),
+        # Trained from scratch, whereas the recipe's values are for a policy that already drives.
+        "point-goal-rl": (
+            "rl.policy=point-goal",
+            "rl.ppo.action_lr=3e-4",
+            "rl.log_std=-1.2,-0.7",
+            "rl.warmup_iterations=0",
+            "rl.imitation=0.0",
+        ),
+    }
+)
+"""The paper's ablations and baselines as settings (tables 1, 2, 5, 6, 11, 13), named as in the benchmark."""
 MAX_RECIPE_BYTES: Final = 1 << 20
 """Upper limit of a recipe file, bytes."""
 
@@ -50,18 +84,18 @@ class RecipeError(ValueError):
 
 @dataclass(frozen=True)
 class Recipe:
-    """Configuration of one training run. A stage's table is None if the caller does not run that stage."""
+    """Configuration of one training run."""
 
     name: str
     seed: int
     model: TicVlaConfig
-    collect: CollectConfig | None = None
-    encoder: EncoderConfig | None = None
-    sft: SftConfig | None = None
-    imitate: ImitateConfig | None = None
-    rl: RlConfig | None = None
-    evaluate: EvaluateConfig | None = None
-    dagger: DaggerConfig = dataclasses.field(default_factory=DaggerConfig)
+    collect: CollectConfig = field(default_factory=CollectConfig)
+    encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    sft: SftConfig = field(default_factory=SftConfig)
+    imitate: ImitateConfig = field(default_factory=ImitateConfig)
+    rl: RlConfig = field(default_factory=RlConfig)
+    evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
+    dagger: DaggerConfig = field(default_factory=DaggerConfig)
 
     def __post_init__(self) -> None:
         if not self.name or not 0 <= self.seed < 2**31:
@@ -69,14 +103,12 @@ class Recipe:
 
     def to_tables(self) -> dict[str, Any]:
         """Return every value of the run, defaults included, as plain tables."""
-        stages = {name: plain(getattr(self, name)) for name in STAGES if getattr(self, name) is not None}
-        dagger = plain(self.dagger)
-        head = {"schema": SCHEMA, "name": self.name, "seed": self.seed}
-        return {**head, "model": self.model.to_dict(), **stages, "dagger": dagger}
+        head = {"schema": SCHEMA, "name": self.name, "seed": self.seed, "model": self.model.to_dict()}
+        return head | {name: plain(getattr(self, name)) for name in (*STAGES, "dagger")}
 
     def to_toml(self) -> str:
         """Return the tables as TOML; `load_recipe` reads it."""
-        return toml_text(self.to_tables())
+        return tomli_w.dumps(self.to_tables())
 
 
 def recipe_names() -> list[str]:
@@ -140,7 +172,7 @@ def filled(default: object, table: object) -> object:
     whole = {**plain(default), **table}
     for name, value in table.items():
         own = getattr(default, str(name), None)
-        if dataclasses.is_dataclass(own):
+        if is_dataclass(own):
             whole[name] = filled(own, value)
     return whole
 
@@ -201,4 +233,4 @@ def _set(content: dict[str, Any], kinds: Mapping[str, type], setting: str) -> No
 
 def _fields_of(kind: object) -> dict[str, Any]:
     """Return the types of a dataclass's fields; empty for other types."""
-    return field_types(kind) if isinstance(kind, type) and dataclasses.is_dataclass(kind) else {}
+    return field_types(kind) if isinstance(kind, type) and is_dataclass(kind) else {}

@@ -1,1 +1,1 @@
-"""Recorded drives on disk: one file per drive, data sets and future poses."""
+"""Recorded drives on disk, the scenes and tasks they are recorded in, and their labels: futures, progress, texts."""

@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 from edge.core.cli import write_whole
-from tools.train.drives.drive import DRIVES, FORMAT, INDEX, Dataset, DriveError, Entry, intact
+from tools.train.config.checks import TrainError
+from tools.train.drives.drive import DRIVES, FORMAT, INDEX, Dataset, Entry, intact
 
 LINES: Final = "index.jsonl"
 
@@ -33,7 +34,7 @@ class DatasetWriter:
     """The only writer of a data set; methods raise OSError if the disk fails."""
 
     def __init__(self, folder: Path) -> None:
-        """Create a data set, or continue one without drives whose file is damaged. Raises DriveError."""
+        """Create a data set, or continue one without drives whose file is damaged. Raises TrainError."""
         (folder / DRIVES).mkdir(parents=True, exist_ok=True)
         self.folder = folder
         self._lock = _locked(folder)
@@ -139,5 +140,5 @@ def _locked(folder: Path) -> IO[bytes]:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         lock.close()
-        raise DriveError(f"{folder}: another process is writing this data set; wait for it or end it") from error
+        raise TrainError(f"{folder}: another process is writing this data set; wait for it or end it") from error
     return lock

@@ -23,6 +23,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from edge.core.geometry import SE2
+from tools.train.config.checks import TrainError
 from tools.train.config.collect import TRACE_EVERY
 
 FUTURE_STEPS: Final = 50
@@ -54,10 +55,6 @@ _ARRAYS: Final[Mapping[str, tuple[str, tuple[int, ...]]]] = {
 }
 
 
-class DriveError(ValueError):
-    """A drive or data set that cannot be used; one line: what, expected, found, what to do."""
-
-
 @dataclass(frozen=True)
 class About:
     """Properties of a whole drive.
@@ -86,10 +83,10 @@ class About:
 
     def __post_init__(self) -> None:
         if not _ID.fullmatch(self.id):
-            raise DriveError(f"drive {self.id!r}: expected an id of letters, digits, '-', '_' and '.'")
+            raise TrainError(f"drive {self.id!r}: expected an id of letters, digits, '-', '_' and '.'")
         at = [trace.get("k") for trace in self.traces]
         if at != [TRACE_EVERY * i for i in range(len(at))]:
-            raise DriveError(f"drive {self.id}: expected a trace every {TRACE_EVERY} frames from 0 on, found {at[:4]}")
+            raise TrainError(f"drive {self.id}: expected a trace every {TRACE_EVERY} frames from 0 on, found {at[:4]}")
 
     @property
     def is_val(self) -> bool:
@@ -126,24 +123,24 @@ class Drive:
     def __post_init__(self) -> None:
         what, count = f"drive {self.about.id}", len(self.jpeg_end)
         if count == 0:
-            raise DriveError(f"{what}: expected frames, found none")
+            raise TrainError(f"{what}: expected frames, found none")
         for name, (kind, shape) in _ARRAYS.items():
             array = getattr(self, name)
             if array.shape != (count, *shape) or array.dtype != kind:
-                raise DriveError(
+                raise TrainError(
                     f"{what}: {name}: expected {kind} {(count, *shape)}, found {array.dtype} {array.shape}"
                 )
             if array.dtype.kind == "f" and not np.isfinite(array).all():
-                raise DriveError(f"{what}: {name} holds a number that is not finite")
+                raise TrainError(f"{what}: {name} holds a number that is not finite")
         if self.jpeg.ndim != 1 or self.jpeg.dtype != np.uint8:
-            raise DriveError(f"{what}: jpeg: expected uint8 [bytes], found {self.jpeg.dtype} {self.jpeg.shape}")
+            raise TrainError(f"{what}: jpeg: expected uint8 [bytes], found {self.jpeg.dtype} {self.jpeg.shape}")
         lengths = np.diff(self.jpeg_end, prepend=0)
         if self.about.driver == TOUR_DRIVER:
             lengths = np.where(np.arange(count) % TRACE_EVERY, lengths + 1, lengths)
         if np.any(lengths <= 0) or (len(self.jpeg) and self.jpeg_end[-1] != len(self.jpeg)):
-            raise DriveError(f"{what}: jpeg_end: expected increasing values up to {len(self.jpeg)}")
+            raise TrainError(f"{what}: jpeg_end: expected increasing values up to {len(self.jpeg)}")
         if np.any((self.future_steps < 0) | (self.future_steps > FUTURE_STEPS)):
-            raise DriveError(f"{what}: future_steps: expected 0 to {FUTURE_STEPS}")
+            raise TrainError(f"{what}: future_steps: expected 0 to {FUTURE_STEPS}")
 
     def __len__(self) -> int:
         return len(self.jpeg_end)
@@ -164,16 +161,16 @@ class Drive:
         return self.about.traces
 
     def frame(self, k: int) -> NDArray[np.uint8]:
-        """Decode image k as uint8 RGB [128, 128, 3]. Raises DriveError without images or if decoding fails."""
+        """Decode image k as uint8 RGB [128, 128, 3]. Raises TrainError without images or if decoding fails."""
         if not len(self.jpeg):
-            raise DriveError(f"drive {self.id}: was loaded without its images")
+            raise TrainError(f"drive {self.id}: was loaded without its images")
         k = self._index(k)
         start = int(self.jpeg_end[k - 1]) if k else 0
         if start == self.jpeg_end[k]:
-            raise DriveError(f"drive {self.id}: frame {k} has no image")
+            raise TrainError(f"drive {self.id}: frame {k} has no image")
         picture = cv2.imdecode(self.jpeg[start : int(self.jpeg_end[k])], cv2.IMREAD_COLOR)
         if picture is None or picture.shape != (PICTURE_PX, PICTURE_PX, 3):
-            raise DriveError(f"drive {self.id}: image {k} is not a JPEG of {PICTURE_PX}x{PICTURE_PX}")
+            raise TrainError(f"drive {self.id}: image {k} is not a JPEG of {PICTURE_PX}x{PICTURE_PX}")
         return np.asarray(picture[..., ::-1].copy(), np.uint8)
 
     def T_world_base(self, k: int) -> SE2:  # noqa: N802  # a pose's name
@@ -204,14 +201,14 @@ class Drive:
 
     @staticmethod
     def load(path: Path, *, pictures: bool = True) -> Drive:
-        """Read a file that `save` wrote; `pictures` False leaves the images out. Raises DriveError."""
+        """Read a file that `save` wrote; `pictures` False leaves the images out. Raises TrainError."""
         try:
             with safe_open(path, framework="numpy") as file:
                 about = _about(path, (file.metadata() or {}).get(_KEY, ""))
                 arrays = {name: file.get_tensor(name) for name in _ARRAYS}
                 jpeg = file.get_tensor("jpeg") if pictures else np.zeros(0, np.uint8)
         except (OSError, SafetensorError) as error:
-            raise DriveError(f"{path}: not a readable drive ({error})") from error
+            raise TrainError(f"{path}: not a readable drive ({error})") from error
         return Drive(about=about, jpeg=jpeg, **arrays)
 
 
@@ -219,16 +216,14 @@ def _about(path: Path, text: str) -> About:
     try:
         content = json.loads(text)
         if content.pop("format") != FORMAT:
-            raise DriveError(f"{path}: expected a drive of format {FORMAT}; record it again")
+            raise TrainError(f"{path}: expected a drive of format {FORMAT}; record it again")
         if set(content) != {each.name for each in fields(About)}:
-            raise DriveError(f"{path}: unknown or missing keys in its header, found {sorted(content)}")
+            raise TrainError(f"{path}: unknown or missing keys in its header, found {sorted(content)}")
         x, y = content["goal_xy"]
         tuples = {key: tuple(content[key]) for key in ("wordings", "told", "traces")}
         return About(**{**content, **tuples, "goal_xy": (float(x), float(y))})
-    except DriveError:
-        raise
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise DriveError(f"{path}: the header is not a drive's") from error
+        raise TrainError(f"{path}: the header is not a drive's") from error
 
 
 @dataclass(frozen=True)
@@ -266,22 +261,22 @@ class Dataset:
 
     @staticmethod
     def open(folder: Path, *, verify: bool = False) -> Dataset:
-        """Read the index of a folder; `verify` also checks the hash of every file. Raises DriveError."""
+        """Read the index of a folder; `verify` also checks the hash of every file. Raises TrainError."""
         path = folder / INDEX
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
             if content["format"] != FORMAT:
-                raise DriveError(f"{path}: expected format {FORMAT}; collect again")
+                raise TrainError(f"{path}: expected format {FORMAT}; collect again")
             entries = tuple(Entry(**entry) for entry in content["drives"])
-        except DriveError:
+        except TrainError:
             raise
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise DriveError(f"{path}: not the index of a data set ({error!r}); record one with collect") from error
+            raise TrainError(f"{path}: not the index of a data set ({error!r}); record one with collect") from error
         dataset = Dataset(folder, tuple(sorted(entries, key=lambda entry: entry.id)))
         if verify:
             for entry in dataset.entries:
                 if not intact(dataset.path(entry.id), entry):
-                    raise DriveError(f"{dataset.path(entry.id)}: differs from the indexed file; collect again")
+                    raise TrainError(f"{dataset.path(entry.id)}: differs from the indexed file; collect again")
         return dataset
 
     def __len__(self) -> int:
@@ -303,10 +298,10 @@ class Dataset:
         return tuple(entry.id for entry in self.entries if entry.val)
 
     def of(self, *prefixes: str) -> Dataset:
-        """Return the drives whose ids begin with one of `prefixes`. Raises DriveError if there are none."""
+        """Return the drives whose ids begin with one of `prefixes`. Raises TrainError if there are none."""
         entries = tuple(entry for entry in self.entries if entry.id.startswith(prefixes))
         if not entries:
-            raise DriveError(
+            raise TrainError(
                 f"{self.folder}: no drives with ids that begin with {' or '.join(prefixes)}; collect again"
             )
         return Dataset(self.folder, entries)
@@ -322,7 +317,7 @@ class Dataset:
         return self.folder / DRIVES / f"{drive_id}.safetensors"
 
     def load(self, drive_id: str, *, pictures: bool = True) -> Drive:
-        """Load one drive. Raises DriveError."""
+        """Load one drive. Raises TrainError."""
         return Drive.load(self.path(drive_id), pictures=pictures)
 
     def drives(self, ids: Sequence[str] | None = None, *, pictures: bool = True) -> Iterator[Drive]:

@@ -21,11 +21,12 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 
 from edge.core.cli import write_whole
-from export.core.typed import build, plain
+from export.core.typed import plain
 from sim_hil.benchmark.suite.episode import ROBOTS
 from sim_hil.benchmark.workers.worker_pool import WorkerEvent, WorkerJob, Workers
+from tools.train.config.checks import TrainError
+from tools.train.config.collect import CORRIDOR, OUTDOORS
 from tools.train.config.encoder import OUTDOORS_LEAST, FramesConfig
-from tools.train.config.scenes import CORRIDOR, OUTDOORS
 from tools.train.drives.drive import file_sha256
 from tools.train.encoder.labels import CLASSES, COLOUR_WORDS, OPENINGS, PIXELS, label_shapes
 from tools.train.run.job import StageProgress
@@ -34,17 +35,13 @@ from tools.train.samples.augment import Picture, decoded
 FORMAT: Final = 2
 WORKER: Final = "tools.train.encoder.worker"
 FIRST_LAYOUT: Final = 10_000_000_000
-"""First seed of the layouts, above all seeds of drives (`tools.train.scenes.scenarios`)."""
+"""First seed of the layouts, above all seeds of drives (`tools.train.drives.scenarios`)."""
 _OF_A_SEED, _HELD_FROM = 1_000_000, 500_000  # layouts per stage seed, and the first held-out one
 _TAG: Final = 0xE0C0
 _POLL_S: Final = 0.5
 _CORRIDOR_MOST: Final = 12  # most people in the corridor
 _LEAST_HELD: Final = 32  # fewest images of a held-out scene, because a scene takes seconds to build
 _EMPTY_SHARE: Final = 0.12  # share of indoor scenes without people
-
-
-class FramesError(ValueError):
-    """Training images that cannot be rendered or read; one line."""
 
 
 @dataclass(frozen=True)
@@ -78,11 +75,6 @@ class Shard:
             "pixels": PIXELS,
         }
         return hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()
-
-    @staticmethod
-    def of_json(content: dict[str, Any]) -> Shard:
-        """Build a shard from `plain` content. Raises FieldError."""
-        return build(Shard, content, "shard")
 
 
 @dataclass(frozen=True)
@@ -153,7 +145,7 @@ def path_of(folder: Path, name: str) -> Path:
 def fill(
     folder: Path, shards: Sequence[Shard], jobs: int, progress: StageProgress, should_stop: Callable[[], bool]
 ) -> None:
-    """Render missing shards. Raises FramesError, OSError, KeyboardInterrupt if `should_stop`."""
+    """Render missing shards. Raises TrainError, OSError, KeyboardInterrupt if `should_stop`."""
     logs = folder / "logs"
     logs.mkdir(parents=True, exist_ok=True)
     for partial in folder.glob("*.partial"):
@@ -182,16 +174,16 @@ def _note(event: WorkerEvent, taken: dict[str, int]) -> None:
     if event.message is not None:
         taken[event.key] = int(event.message["frames"])
     elif event.failure:
-        raise FramesError(f"pictures of {event.key}: their process {event.failure}; go on with --resume")
+        raise TrainError(f"pictures of {event.key}: their process {event.failure}; go on with --resume")
 
 
 def frames_sha256(folder: Path, shards: Sequence[Shard]) -> str:
-    """Hash all shards; it does not depend on the order of rendering. Raises FramesError for a missing shard."""
+    """Hash all shards; it does not depend on the order of rendering. Raises TrainError for a missing shard."""
     lines = []
     for shard in shards:
         there = made(folder, shard)
         if there is None:
-            raise FramesError(f"{path_of(folder, shard.name)}: missing, or of another configuration")
+            raise TrainError(f"{path_of(folder, shard.name)}: missing, or of another configuration")
         lines.append(f"{there.name} {there.sha256}\n")
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 
@@ -200,7 +192,7 @@ class FrameSet:
     """Images of some shards as one sequence; labels are in memory, images are read on access."""
 
     def __init__(self, folder: Path, shards: Sequence[Shard]) -> None:
-        """Open all shards. Raises FramesError for a missing one."""
+        """Open all shards. Raises TrainError for a missing one."""
         self._files: list[Any] = []
         self._ends: list[NDArray[np.int64]] = []
         parts: dict[str, list[NDArray[np.generic]]] = {}
@@ -211,10 +203,10 @@ class FrameSet:
                 labels = {name: file.get_tensor(name) for name in label_shapes(shard.side)}
                 ends = file.get_tensor("jpeg_end")
             except (OSError, SafetensorError) as error:
-                raise FramesError(f"{path}: not readable ({error}); delete it and continue with --resume") from error
+                raise TrainError(f"{path}: not readable ({error}); delete it and continue with --resume") from error
             for name, (kind, shape) in label_shapes(shard.side).items():
                 if labels[name].shape != (shard.frames, *shape) or labels[name].dtype != kind:
-                    raise FramesError(f"{path}: {name}: expected {kind} {(shard.frames, *shape)}; delete it")
+                    raise TrainError(f"{path}: {name}: expected {kind} {(shard.frames, *shape)}; delete it")
                 parts.setdefault(name, []).append(labels[name])
             self._files.append(file.get_slice("jpeg"))
             self._ends.append(ends)

@@ -21,9 +21,7 @@ from sim_hil.simulation.renderer import Renderer
 from sim_hil.world.drawing.mesh import MeshBuilder, Surface, Vec2, Vec3
 from sim_hil.world.drawing.stage import Quaternion
 from sim_hil.world.drawing.textures import Colour, Image
-from sim_hil.world.pieces import Pieces
-from sim_hil.world.scene_meshes import add_object
-from sim_hil.world.shell import add_ceiling, add_floor, add_terrain, add_wall
+from sim_hil.world.scene_meshes import Pieces, add_ceiling, add_floor, add_object, add_terrain, add_wall
 from sim_hil.world.wall_visibility import Sight, Visibility
 
 Array = NDArray[np.float64]
@@ -132,7 +130,7 @@ class IdWorld:
         flat = float(np.hypot(view.ahead[0], view.ahead[1]))
         if up[2] < _UPRIGHT or flat < _UPRIGHT:
             return None
-        return self._visibility.look(view.eye[:2], view.ahead[:2] / flat, view.half_width / (flat * float(up[2])))
+        return self._visibility.sight(view.eye[:2], view.ahead[:2] / flat, view.half_width / (flat * float(up[2])))
 
     def _show_people(self, state: Array, eye: Array, sight: Sight | None) -> None:
         rows = state[self.mount.fields :].reshape(len(self._looks), RENDER_FIELDS)

@@ -9,25 +9,21 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
-from edge.core.geometry import SE2
 from edge.motion.controller import TARGET_TIME_S, arc_to, target_of
-from edge.state.reasoning_text import WAYPOINT_TIMES_S, Waypoints
+from edge.state.reasoning_text import WAYPOINT_TIMES_S
 from edge.state.semantic import waypoints_now
 from tools.train.config.collect import RATE_HZ
 from tools.train.config.imitate import ImitateEvalConfig
+from tools.train.drives.walls import OPEN_M, room
 from tools.train.imitate.data import SampleChoice, Samples
 from tools.train.samples.action_batch import ActionBatch, Group, collate
-from tools.train.scenes.walls import OPEN_M, room
 
 Array = NDArray[np.float64]
 Planner = Callable[[ActionBatch], Tensor]
@@ -35,9 +31,6 @@ Planner = Callable[[ActionBatch], Tensor]
 
 HORIZONS_S: Final = (1, 2, 3, 5)
 POLICY, KEEP, WAYPOINTS, OTHER_STATE = "policy", "keep_state", "waypoints", "other_words"
-_COLOURS: Final[Mapping[str, str]] = {
-    POLICY: "#1f6f8b", KEEP: "#5b6774", WAYPOINTS: "#2c8c4a", OTHER_STATE: "#d1603d",
-}  # fmt: skip
 _TAG: Final = 0xADE
 
 
@@ -206,39 +199,7 @@ def _score(
                 scores.add(name, age_s, arrays[row], target, known)
             scores.add(KEEP, age_s, kept[i], target, known)
             if points is not None:
-                straight = _straight(points, drive.offset(one.anchor, k), (k - one.anchor) / RATE_HZ, steps)
+                now = waypoints_now(points, drive.offset(one.anchor, k))[0].astype(np.float64)
+                straight = to_waypoints(now, (k - one.anchor) / RATE_HZ, steps)
                 scores.add(WAYPOINTS, age_s, straight, target, known)
             row += 1
-
-
-def _straight(points: Waypoints, offset: SE2, since_s: float, steps: int) -> Array:
-    return to_waypoints(waypoints_now(points, offset)[0].astype(np.float64), since_s, steps)
-
-
-def draw_errors(result: Mapping[str, Any], path: Path) -> None:
-    """Plot the errors by delay as a PNG file. Raises OSError."""
-    bins = result["by_delay"]
-    figure = Figure(figsize=(9.0, 3.4), layout="constrained")
-    FigureCanvasAgg(figure)
-    left, right = figure.subplots(1, 2)
-    ages = [(each["from_s"] + each["to_s"]) / 2 for each in bins]
-    for name in sorted(result["all"]):
-        rows = [each[name] for each in bins]
-        horizons = [horizon for row in rows if row["samples"] for horizon in row["fde_m"]]
-        if not horizons:
-            continue
-        horizon_name = "3s" if "3s" in horizons else max(horizons)
-        for axis, values in (
-            (left, [row.get("fde_m", {}).get(horizon_name, np.nan) for row in rows]),
-            (right, [row.get("yaw_rate_radps", np.nan) for row in rows]),
-        ):
-            axis.plot(ages, values, marker="o", markersize=3, label=name.replace("_", " "), color=_COLOURS[name])
-        left.set_ylabel(f"error after {horizon_name[:-1]} s, m")
-    right.set_ylabel("error of the yaw rate, rad/s")
-    for axis in (left, right):
-        axis.set_xlabel("age of the semantic state, s")
-        axis.set_ylim(bottom=0)
-        axis.grid(color="#dfe4e9", linewidth=0.6)
-    right.legend(loc="best", fontsize=8, frameon=False)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110, metadata={"Software": None})

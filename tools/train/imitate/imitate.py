@@ -7,71 +7,56 @@ DAgger round imitation continues from its weights on all drives.
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any, Final
 
+import numpy as np
 import torch
 
-from export.checkpoint import tokenizer_for
+from export.checkpoint.tokenizer import tokenizer_for
 from export.model.network import TicVla
-from tools.train.config.collect import PLANNED_DRIVE_S
-from tools.train.config.imitate import POINT_GOAL, TIC_VLA, DelayConfig, ImitateConfig, SampleConfig
-from tools.train.config.recipe import Recipe
+from tools.train.config.imitate import POINT_GOAL, DelayConfig, ImitateConfig, SampleConfig
 from tools.train.drives.drive import Dataset
-from tools.train.imitate.data import NoStates, SampleError, Samples, States
-from tools.train.imitate.evaluation import draw_errors, evaluate
-from tools.train.imitate.mirror_drives import (
-    MIRROR,
-    BothStates,
-    BothTokens,
-    Mirror,
-    MirroredDrives,
-    MirrorTokens,
-    balanced,
-    mirrored_frames,
+from tools.train.drives.walls import Scenes
+from tools.train.imitate.data import Delays, NoStates, SampleError, Samples, Source, States
+from tools.train.imitate.evaluation import evaluate
+from tools.train.imitate.trainable_policies import (
+    ActionExpertPolicy,
+    PointGoalNet,
+    PointGoalNetPolicy,
+    TrainablePolicy,
+    build_point_goal,
+    save_point_goal,
 )
-from tools.train.imitate.mirror_drives import STATES as MIRRORED_STATES
-from tools.train.imitate.point_goal_net import PointGoalNet, build_point_goal, save_point_goal
-from tools.train.imitate.steps import ImitateError, Training
-from tools.train.imitate.trainable_policies import ActionExpertPolicy, PointGoalNetPolicy, TrainablePolicy
+from tools.train.run.distributed import autocast
 from tools.train.run.job import StageJob
+from tools.train.run.loop import Ahead, Optimiser, TrainingLoop
 from tools.train.run.network_file import finish_network, read_network, stage_weights, start_network
-from tools.train.run.own_drives import drives_after
-from tools.train.samples.delays import Delays
+from tools.train.run.run_dir import drives_after
+from tools.train.samples.action_batch import Group, collate
 from tools.train.samples.drive_frames import DriveFrames
-from tools.train.samples.kv_build import SEEN_PARTS, build_kv_cache, parts_sha256
-from tools.train.samples.kv_cache import KvCache
+from tools.train.samples.kv_cache import SEEN_PARTS, KvCache, build_kv_cache, parts_sha256
 from tools.train.samples.language_batch import FrameTokens
 from tools.train.samples.mirror import FOLDER as MIRRORED
-from tools.train.samples.mirror import SecondsDataset
+from tools.train.samples.mirror import STATES as MIRRORED_STATES
+from tools.train.samples.mirror import MirroredDrives, MirrorTokens, SecondsDataset, balanced, mirrored_frames
 from tools.train.samples.tokens import TokenCache
-from tools.train.scenes.walls import Scenes
 
 STAGE: Final = "imitate"
 STATES: Final = "kv"
 """Folder of the semantic states, in the data set."""
 POINT_GOAL_FILE: Final = "point_goal.safetensors"
-_START: Final = 0x1A14
-
-
-def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
-    """Return (description, number, key of the throughput) of this stage's work, from the planned number of drives."""
-    config = recipe.imitate or ImitateConfig()
-    seconds = round(PLANNED_DRIVE_S * recipe.collect.episodes) if recipe.collect is not None else 0
-    states = [("semantic states", seconds * config.states.draws, "kv")] if config.policy == TIC_VLA else []
-    return [*states, ("samples learned", config.samples, "imitate")]
+_DRAWS, _HELD, _NOISE, _START = 0x1A11, 0x1A12, 0x1A13, 0x1A14
 
 
 def run(job: StageJob) -> dict[str, Any]:
     """Train on the run's drives and write the network with its new action expert, or the point-goal network.
 
-    Raises ImitateError, SampleError, LatencyError, DriveError, TokenCacheError, KvCacheError, NetworkFileError.
+    Raises TrainError, SampleError, LatencyError.
     """
-    config = _config(job)
-    dataset = drives_after(job, STAGE)
+    config = job.recipe.imitate
+    dataset = drives_after(job.run_dir, job.recipe, STAGE)
     network, share = _start(job, config)
     tokens = _encoded(job, TokenCache(dataset, network.vision), dataset.ids)
     seconds: TokenCache | None = None
@@ -85,7 +70,7 @@ def run(job: StageJob) -> dict[str, Any]:
     mirror = None
     if seconds is not None:
         mirror_tokens, mirrored = MirrorTokens(seconds), MirroredDrives.of(dataset)
-        mirror = Mirror(mirror_tokens, _states(job, network, mirrored, mirror_tokens, MIRRORED_STATES, dataset.train))
+        mirror = Source(mirror_tokens, _states(job, network, mirrored, mirror_tokens, MIRRORED_STATES, dataset.train))
     own = None
     if config.evaluate.own_words and dataset.val:
         own = _states(job, network, dataset, tokens, STATES, dataset.val, own=True)
@@ -116,7 +101,7 @@ def _states(
     own: bool = False,
 ) -> KvCache:
     """Build the semantic states of drives with the true text, or (`own`) with text that the language model decodes."""
-    config = _config(job).states
+    config = job.recipe.imitate.states
     job.progress.say("semantic states")
     return build_kv_cache(
         dataset.folder / folder,
@@ -138,8 +123,8 @@ def _point_goal(
 ) -> dict[str, Any]:
     student: PointGoalNet = build_point_goal(network.config, job.generator(_START)).to(job.device)
     states = NoStates({entry.id: entry.frames for entry in dataset.entries}, network.config.kv_dim)
-    mirror = None if seconds is None else Mirror(MirrorTokens(seconds), states)
-    policy = PointGoalNetPolicy(student, _config(job).loss)
+    mirror = None if seconds is None else Source(MirrorTokens(seconds), states)
+    policy = PointGoalNetPolicy(student, job.recipe.imitate.loss)
     result = fit(job, policy, dataset, tokens, states, of=parts_sha256(network, ("vision",)), mirror=mirror)
     if job.ranks.first:
         path = job.run_dir.stage(STAGE) / POINT_GOAL_FILE
@@ -168,34 +153,48 @@ def fit(
     *,
     of: str,
     share: float = 1.0,
-    mirror: Mirror | None = None,
+    mirror: Source | None = None,
     own: States | None = None,
 ) -> dict[str, Any]:
-    """Train a policy in place and return its errors against the expert. Raises ImitateError, SampleError.
+    """Train a policy in place and return its errors against the expert. Raises TrainError, SampleError.
 
     `of`: hash of what tokens and states were computed with; `share` of the recipe's samples; `mirror`: mirrored
     training drives; `own`: states of the held-out drives with text that the language model decoded.
     """
-    config = _config(job)
+    config = job.recipe.imitate
     delays = Delays.of(config.delays) if config.inject_delay and policy.uses_semantics else Delays.none()
     scenes = Scenes() if config.loss.walls else None
     drives = _frames(job, dataset, dataset.train, config.sample, scenes)
     if mirror is not None:
         reflected = _frames(job, MirroredDrives.of(dataset), dataset.train, config.sample, scenes)
         drives = balanced(drives, [mirrored_frames(drive) for drive in reflected], config.mirrored)
-        tokens, states = BothTokens(tokens, mirror.tokens), BothStates(states, mirror.states)
-    data = _samples(job, drives, tokens, states, delays, policy)
+    data = _samples(job, drives, tokens, states, delays, policy, mirror)
     unseen = _frames(job, dataset, dataset.val, config.sample.undisturbed(), scenes)
     held = _held_out(job, unseen, tokens, states, delays, policy)
     policy.begin(data.drives)
     total = max(1, round(config.samples * share) // config.batch)
     job.ranks.copy_parameters(policy.module.parameters())
-    training = Training(STAGE, job, config, policy, data, held, total, _key(config, dataset, policy, of, total))
-    numbers = training.run()
+    optimiser = Optimiser(policy.module.parameters(), config.optim, total, job.ranks)
+    shapes = {name: list(tensor.shape) for name, tensor in policy.module.state_dict().items()}
+    content = {"config": asdict(config), "dataset": dataset.sha256, "of": of, "total": total, "pupil": shapes}
+    loop = TrainingLoop(job, STAGE, {"pupil": policy.module}, optimiser, content, config.checkpoint_steps)
+    with Ahead(lambda step: _share(job, data, step)) as ahead:
+
+        def evaluate_loss(step: int) -> dict[str, float]:
+            if held is None or (step % config.held_steps and step != total):
+                return {}
+            ahead.rest()
+            return {"held_loss": _held_loss(job, policy, held)}
+
+        numbers = loop.run(
+            ahead.steps(optimiser.step_count, total),
+            lambda groups: _losses(job, policy, groups, optimiser.step_count),
+            evaluate_loss,
+        )
     result: dict[str, Any] = {
         "steps": total,
         "drives": len(dataset.train),
-        "frames": sum(len(drive) for drive in drives if not drive.id.startswith(MIRROR)),
+        "frames": sum(len(drive) for drive in drives if not drive.in_mirror),
         "mean_age_s": delays.mean_s,
         **numbers,
     }
@@ -208,8 +207,36 @@ def fit(
                 policy.plan, samples, config.evaluate, seed=job.seed, device=torch.device(job.device),
                 semantics=policy.uses_semantics,
             )  # fmt: skip
-            draw_errors(result[name], job.run_dir.curves / f"{STAGE}_{name}.png")
     return result
+
+
+def _share(job: StageJob, data: Samples, step: int) -> list[Group]:
+    """Draw this rank's share of a step's groups, each from its own generator."""
+    own = range(job.recipe.imitate.batch // data.group)[job.ranks.rank :: job.ranks.world]
+    return [data.draw(np.random.default_rng((job.seed, _DRAWS, step, number))) for number in own]
+
+
+def _losses(job: StageJob, policy: TrainablePolicy, groups: Sequence[Group], step: int) -> torch.Tensor:
+    generator = job.generator(_NOISE, step, job.ranks.rank)
+    batch = collate(groups, torch.device(job.device))
+    with autocast(job.device, job.recipe.imitate.optim.bf16):
+        return policy.errors(batch, generator)
+
+
+def _held_loss(job: StageJob, policy: TrainablePolicy, held: Samples) -> float:
+    """Compute the loss over the fixed held-out samples, distributed over the ranks."""
+    config, ranks = job.recipe.imitate, job.ranks
+    count, each = -(-config.held_samples // held.group), config.batch // held.group
+    total, seen = 0.0, 0
+    for start in range(ranks.rank * each, count, ranks.world * each):
+        numbers = range(start, min(start + each, count))
+        groups = [held.draw(np.random.default_rng((job.seed, _HELD, number))) for number in numbers]
+        with torch.no_grad():
+            errors = _losses(job, policy, groups, start)
+        total += float(errors.sum())
+        seen += len(errors)
+    whole = ranks.sum(seen)
+    return ranks.sum(total) / whole if whole else float("nan")
 
 
 def _frames(
@@ -232,14 +259,16 @@ def _samples(
     states: States,
     delays: Delays,
     policy: TrainablePolicy,
+    mirror: Source | None = None,
     *,
     held: bool = False,
 ) -> Samples:
-    config, model = _config(job).sample, job.recipe.model
+    config, model = job.recipe.imitate.sample, job.recipe.model
     if not policy.uses_semantics:
         # Such a policy works with any semantic interface.
         model = replace(model, action=replace(model.action, semantic_interface="kv"))
-    return Samples(drives, tokens, states, delays, config.undisturbed() if held else config, model, drop=not held)
+    used = config.undisturbed() if held else config
+    return Samples(drives, tokens, states, delays, used, model, mirror=mirror, drop=not held)
 
 
 def _held_out(
@@ -251,21 +280,3 @@ def _held_out(
         return _samples(job, drives, tokens, states, delays, policy, held=True)
     except SampleError:
         return None
-
-
-def _config(job: StageJob) -> ImitateConfig:
-    if job.recipe.imitate is None:
-        raise ImitateError("the recipe has no table [imitate]")
-    return job.recipe.imitate
-
-
-def _key(config: ImitateConfig, dataset: Dataset, policy: TrainablePolicy, of: str, total: int) -> str:
-    """Hash what a checkpoint depends on; only an equal hash can be resumed."""
-    made = {
-        "config": asdict(config),
-        "dataset": dataset.sha256,
-        "of": of,
-        "total": total,
-        "pupil": {name: list(tensor.shape) for name, tensor in policy.module.state_dict().items()},
-    }
-    return hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()

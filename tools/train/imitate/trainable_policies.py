@@ -1,20 +1,109 @@
-"""The policies that imitation trains: the action expert, or the paper's point-goal baseline."""
+"""The policies that imitation trains: the action expert, or the paper's point-goal baseline without language (4.1)."""
 
 from __future__ import annotations
 
+import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
+from pathlib import Path
+from typing import Final
 
 import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from export.model.action import ActionExpert
+from export.model.attention import projection
+from export.model.config import TicVlaConfig
+from tools.train.config.checks import TrainError
 from tools.train.config.imitate import LossConfig
-from tools.train.imitate.point_goal_net import PointGoalNet
+from tools.train.drives.walls import too_near
 from tools.train.samples import action_batch
 from tools.train.samples.action_batch import ActionBatch
 from tools.train.samples.drive_frames import DriveFrames
-from tools.train.scenes.walls import too_near
+
+FORMAT: Final = "tic-vla-edge-point-goal/1"
+_KEY: Final = "point_goal"  # the only metadata key: the order of several keys would not be reproducible
+GOAL_SCALE_M: Final = 10.0
+"""Unit of the goal distance, m."""
+GOAL_MOST: Final = 3.0
+"""Clip of the goal distance, in units of GOAL_SCALE_M (30 m)."""
+
+
+class PointGoalNet(nn.Module):
+    """Maps visual tokens [n, N, D], state [n, 3] and goal [n, 2] m to plans [n, steps, 3], in the robot frame."""
+
+    def __init__(self, config: TicVlaConfig) -> None:
+        super().__init__()
+        self.config = config
+        width = config.value.channels
+        layers: list[nn.Module] = []
+        channels = config.vision.token_dim
+        for _ in range(config.value.conv_layers):
+            layers += [nn.Conv1d(channels, width, 3, stride=2, padding=1), nn.ReLU()]
+            channels = width
+        self.convolutions = nn.Sequential(*layers, nn.AdaptiveAvgPool1d(1), nn.Flatten())
+        self.low_dimensional = projection(6, width)
+        self.head = nn.Sequential(nn.Linear(2 * width, width), nn.ReLU())
+        self.out = nn.Linear(width, 3 * config.action.steps)
+
+    def features(self, visual_tokens: Tensor, state: Tensor, goal: Tensor) -> Tensor:
+        """Compute the features [n, channels] from which the plan is computed."""
+        distance = goal.norm(dim=-1, keepdim=True)
+        # Separate direction and distance: both are distinguished equally well at every distance.
+        direction = goal / distance.clamp(min=1e-3)
+        low = torch.cat([state, (distance / GOAL_SCALE_M).clamp(max=GOAL_MOST), direction], dim=-1)
+        seen = self.convolutions(visual_tokens.transpose(1, 2))
+        plans: Tensor = self.head(torch.cat([seen, self.low_dimensional(low)], dim=-1))
+        return plans
+
+    def forward(self, visual_tokens: Tensor, state: Tensor, goal: Tensor) -> Tensor:
+        steps = self.out(self.features(visual_tokens, state, goal)).float()
+        return torch.cumsum(steps.unflatten(-1, (-1, 3)), dim=1)
+
+
+def build_point_goal(config: TicVlaConfig, generator: torch.Generator) -> PointGoalNet:
+    """Build an untrained network whose plan is a slow straight walk; weights depend on the generator alone."""
+    network = PointGoalNet(config)
+    with torch.no_grad():
+        for module in network.modules():
+            if isinstance(module, nn.Conv1d | nn.Linear):
+                fan_in = module.weight[0].numel()
+                # He initialisation, for ReLU activations.
+                module.weight.normal_(0.0, (2.0 / fan_in) ** 0.5, generator=generator)
+                if module.bias is not None:
+                    module.bias.zero_()
+        network.out.weight.mul_(1e-2)
+        network.out.bias.copy_(torch.tensor(config.action.initial_step).repeat(config.action.steps))
+    return network
+
+
+def save_point_goal(network: PointGoalNet, path: Path, origin: str) -> None:
+    """Write the weights atomically. Raises OSError."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in network.state_dict().items()}
+    about = {"format": FORMAT, "config": network.config.to_dict(), "origin": origin}
+    save_file(tensors, str(partial), metadata={_KEY: json.dumps(about, sort_keys=True)})
+    partial.replace(path)
+
+
+def load_point_goal(path: Path, config: TicVlaConfig) -> PointGoalNet:
+    """Load a network that `save_point_goal` wrote, in evaluation mode. Raises TrainError."""
+    network = PointGoalNet(config)
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            if json.loads((file.metadata() or {}).get(_KEY, "{}")).get("format") != FORMAT:
+                raise TrainError(f"{path}: expected a point-goal network of edge-train")
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 — not a mapping
+    except (OSError, SafetensorError, json.JSONDecodeError) as error:
+        raise TrainError(f"{path}: not readable ({error})") from error
+    wanted = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
+    if {name: tuple(tensor.shape) for name, tensor in tensors.items()} != wanted:
+        raise TrainError(f"{path}: expected tensors of another size; train the network again")
+    network.load_state_dict(tensors)
+    return network.eval()
 
 
 def plan_loss(config: LossConfig, plan: Tensor, batch: ActionBatch) -> Tensor:

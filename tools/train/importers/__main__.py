@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping
 from pathlib import Path
-from types import ModuleType
-from typing import Any, Final
+from typing import Any
 
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED, check_result_target, command_line, write_result
+from tools.train.config.checks import TrainError
 from tools.train.drives.dataset import DatasetWriter
-from tools.train.drives.drive import DriveError, Entry
-from tools.train.importers import gnd, scand
+from tools.train.drives.drive import Entry
 from tools.train.importers.cut import drives
-from tools.train.importers.recording import ImportedError
-
-LAYOUTS: Final[Mapping[str, ModuleType]] = {scand.KIND: scand, gnd.KIND: gnd}
+from tools.train.importers.recording import LAYOUTS
 
 EXAMPLES = """examples:
   python -m tools.train.importers scand extracted/scand --robot jackal --out data/real
@@ -29,15 +25,15 @@ exit codes: 0 done, 2 bad input, 130 interrupted
 def import_folder(root: Path, layout: str, robot: str, out: Path) -> dict[str, Any]:
     """Import every recording below `root` into the data set `out`; existing drives are kept. Returns counts.
 
-    Raises ImportedError, DriveError, OSError.
+    Raises TrainError, OSError.
     """
-    module = LAYOUTS[layout]
-    folders = sorted(folder for folder in root.iterdir() if folder.is_dir() and module.is_recording(folder))
+    form = LAYOUTS[layout]
+    folders = sorted(folder for folder in root.iterdir() if folder.is_dir() and form.fits(folder))
     if not folders:
-        raise ImportedError(f"{root}: found no recording of {layout}; {module.__name__} describes its folders")
+        raise TrainError(f"{root}: found no recording of {layout}; expected folders with {' and '.join(form.files)}")
     with DatasetWriter(out) as writer:
         for folder in folders:
-            for drive in drives(module.read(folder), layout, robot):
+            for drive in drives(form.read(folder), layout, robot):
                 if not writer.has(drive.id):
                     path = writer.path(drive.id)
                     drive.save(path)
@@ -64,7 +60,7 @@ def main(argv: list[str] | None = None) -> int:
         check_result_target(args.json)
         result = import_folder(args.root, args.layout, args.robot, args.out)
         write_result(args.json, result)
-    except (ImportedError, DriveError, OSError) as error:
+    except (TrainError, OSError) as error:
         sys.stderr.write(f"importers: {error}\n")
         return EXIT_BAD_INPUT
     except KeyboardInterrupt:

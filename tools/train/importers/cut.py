@@ -11,10 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tools.train.config.checks import TrainError
 from tools.train.config.collect import RATE_HZ, TRACE_EVERY
 from tools.train.drives.drive import EXPERT, FUTURE_STEPS, PICTURE_PX, PLAN_TIMES_S, About, Drive
 from tools.train.drives.futures import driven_future, relative
-from tools.train.importers.recording import ImportedError, Recording, Texts, read_picture
+from tools.train.importers.recording import Recording, Texts, read_picture
 
 Array = NDArray[np.float64]
 
@@ -68,17 +69,17 @@ def _poses_at(poses: Array, times: Array) -> Array:
 def drives(recording: Recording, kind: str, robot: str) -> Iterator[Drive]:
     """Yield episodes of 20 s, one after the other; shorter remainders are left out.
 
-    Raises ImportedError for an unreadable image and for texts of an episode that does not exist.
+    Raises TrainError for an unreadable image and for texts of an episode that does not exist.
     """
     parts = [(piece, k) for piece in pieces(recording) for k in range(0, len(piece.pose) - FRAMES + 1, FRAMES)]
     if unknown := sorted(set(recording.words) - set(range(len(parts)))):
-        raise ImportedError(
+        raise TrainError(
             f"recording {recording.name}: texts for episode {unknown[0]}; expected a number below {len(parts)}"
         )
     for number, (piece, start) in enumerate(parts):
         words = recording.words.get(number, Texts())
         if words.traces and len(words.traces) != FRAMES // TRACE_EVERY:
-            raise ImportedError(
+            raise TrainError(
                 f"recording {recording.name}: episode {number}: expected {FRAMES // TRACE_EVERY} traces, one a second, "
                 f"found {len(words.traces)}"
             )
@@ -141,5 +142,5 @@ def _jpeg(recording: Recording, index: int) -> NDArray[np.uint8]:
     small = cv2.resize(picture, (PICTURE_PX, PICTURE_PX), interpolation=cv2.INTER_AREA)
     done, jpeg = cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     if not done:
-        raise ImportedError(f"{recording.pictures[index]}: could not be compressed")
+        raise TrainError(f"{recording.pictures[index]}: could not be compressed")
     return np.asarray(jpeg, np.uint8).ravel()

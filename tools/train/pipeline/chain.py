@@ -1,24 +1,33 @@
-"""The steps of a run in order, each run once: a stage, a DAgger round, or a stage that continues after a round."""
+"""The steps of a run in order, each run once: a stage, a DAgger round, or a stage that continues after a round.
+
+The work of the steps is estimated before a run from measured throughputs.
+"""
 
 from __future__ import annotations
 
 import shutil
+import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
+from pathlib import Path
 from typing import Any, Final
 
-from tools.train.collect import collect
-from tools.train.collect.dagger import run_round
+from reporting.progress import duration
+from tools.train.collect.collection import collect, run_round
+from tools.train.config.checks import TrainError
+from tools.train.config.collect import RATE_HZ
+from tools.train.config.imitate import TIC_VLA
 from tools.train.config.recipe import Recipe
+from tools.train.config.sft import SftConfig
 from tools.train.drives.drive import file_sha256
 from tools.train.encoder import encoder
 from tools.train.imitate import imitate
 from tools.train.pipeline import evaluate
 from tools.train.rl import rl
-from tools.train.run.exported import export_artifacts
+from tools.train.run.distributed import computes_bf16
 from tools.train.run.job import StageJob
-from tools.train.run.network_file import ORDER, START, stage_weights, weights_before
-from tools.train.run.run_dir import RunDir, RunDirError
+from tools.train.run.network_file import ORDER, START, export_artifacts, stage_weights, weights_before
+from tools.train.run.run_dir import RunDir
 from tools.train.sft import sft
 
 ALL: Final = ("collect", "encoder", "sft", "imitate", "dagger", "rl", "evaluate")
@@ -32,8 +41,8 @@ ADOPTED: Final = "adopted"
 """Key in the result of a stage that did not run here because the run started with that stage's weights."""
 
 StageRun = Callable[[StageJob], dict[str, Any]]
-RUNS: Final[Mapping[str, StageRun]] = {
-    "collect": collect.run,
+RUNS: Final[dict[str, StageRun]] = {
+    "collect": collect,
     "encoder": encoder.run,
     "sft": sft.run,
     "imitate": imitate.run,
@@ -82,29 +91,27 @@ def is_done(run_dir: RunDir, step: Step) -> bool:
 
 
 def may_begin(run_dir: RunDir, step: Step, resume: bool) -> None:
-    """Raise RunDirError if a step would overwrite existing files."""
+    """Raise TrainError if a step would overwrite existing files."""
     where = step.name if step.stage == "dagger" else step.stage
     if step.stage in ("collect", "dagger") and run_dir.borrowed("collect"):
-        raise RunDirError(f"{run_dir.out}: its drives belong to another run (--from); set dagger.rounds=0")
+        raise TrainError(f"{run_dir.out}: its drives belong to another run (--from); set dagger.rounds=0")
     again = step.stage in GO_ON and step.round > run_dir.retired(step.stage)
     if run_dir.begun(where) and not resume and not again:
-        raise RunDirError(
-            f"{run_dir.out / where}: already started; continue with --resume, or delete it to start again"
-        )
+        raise TrainError(f"{run_dir.out / where}: already started; continue with --resume, or delete it to start again")
 
 
 def steps_until(name: str, recipe: Recipe, wanted: Sequence[Step]) -> list[Step]:
     """Return the steps up to `name`; `wanted` are the steps to run after them.
 
-    Raises RunDirError if the recipe has no such step, the step leaves no policy, or a later step needs earlier drives.
+    Raises TrainError if the recipe has no such step, the step leaves no policy, or a later step needs earlier drives.
     """
     steps = steps_of("all", recipe)
     policies = [step.name for step in steps if step.stage in ("imitate", "rl")]
     if name not in policies:
-        raise RunDirError(f"--after {name}: expected one of {', '.join(policies)}")
+        raise TrainError(f"--after {name}: expected one of {', '.join(policies)}")
     before = steps[: [step.name for step in steps].index(name) + 1]
     if not recipe.dagger.newest_only and any(step.stage == "dagger" and step not in before for step in wanted):
-        raise RunDirError(f"--after {name}: the run has no drives from before it; set dagger.newest_only=true")
+        raise TrainError(f"--after {name}: the run has no drives from before it; set dagger.newest_only=true")
     return before
 
 
@@ -123,7 +130,7 @@ def adopt(run_dir: RunDir, steps: Sequence[Step]) -> None:
     shutil.copyfile(start, run_dir.model_path)
 
 
-def run_step(job: StageJob, step: Step, stage_run: Callable[[str], StageRun] | None = None) -> dict[str, Any]:
+def run_step(job: StageJob, step: Step) -> dict[str, Any]:
     """Run one step and record its result. Raises the stage's errors."""
     if step.stage == "dagger":
         result = _round(job, step)
@@ -137,21 +144,152 @@ def run_step(job: StageJob, step: Step, stage_run: Callable[[str], StageRun] | N
             job.run_dir.retire(step.stage, f"{step.stage}-{step.round - 1}")
         job.ranks.barrier()
         job = replace(job, resume=False)
-    result = (stage_run or module_run)(step.stage)(job)
+    result = RUNS[step.stage](job)
     if job.ranks.first:
         job.run_dir.finish(step.stage, result)
     return result
 
 
-def module_run(stage: str) -> StageRun:
-    """Return the function that runs a stage."""
-    return RUNS[stage]
-
-
 def _round(job: StageJob, step: Step) -> dict[str, Any]:
     weights = weights_before(job.run_dir.out, "rl")
     if weights is None or weights.parent.name != "imitate":
-        raise RunDirError(f"{job.run_dir.out}: {step.name} needs a policy; run imitate first")
+        raise TrainError(f"{job.run_dir.out}: {step.name} needs a policy; run imitate first")
     folder = job.run_dir.stage(step.name)
     artifacts = export_artifacts(weights, job.recipe.model, folder / "artifacts", job.progress.say)
     return run_round(job, artifacts, step.round)
+
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+Work = list[tuple[str, int, str]]
+"""(description, number of samples, key in the throughput table) of each kind of work."""
+
+FILE: Final = Path(__file__).with_name("throughput.toml")
+_DRIVE_S, _TOUR_S, _EPISODE_STEPS = 30.0, 45.0, 300  # typical lengths; an episode's are of 0.1 s
+_OF_TOURS: Final = "tours: "  # prefix of the lines that concern tours
+_DECIDE: Final = 0.3  # share of deciding anchors, measured in `nano`'s 328 drives
+_RELABELLED: Final = 0.2  # share of a drive's anchors that each other instruction adds, measured in 16 drives
+
+
+@dataclass(frozen=True)
+class Line:
+    """One kind of work of a step; `rate` in samples per second, None if it was not measured."""
+
+    step: str
+    what: str
+    samples: int
+    rate: float | None
+
+    @property
+    def seconds(self) -> float | None:
+        """Estimated duration, s; None without a measured rate."""
+        return None if self.rate is None else self.samples / self.rate
+
+
+def throughputs(model: str, device: str) -> Mapping[str, float]:
+    """Return measured samples per second by key for a network and a device; empty if none were measured."""
+    tables = tomllib.loads(FILE.read_text(encoding="utf-8"))
+    kind = device.partition(":")[0]
+    if kind == "cpu" and not computes_bf16(kind):
+        kind = "cpu-float32"
+    found: Mapping[str, float] = tables.get(model, {}).get(kind, {}).get("rates", {})
+    return found
+
+
+def budget_of(recipe: Recipe, steps: Sequence[Step], device: str) -> list[Line]:
+    """Return the work of every step."""
+    rates = throughputs(recipe.model.name, device)
+    lines: list[Line] = []
+    for step in steps:
+        lines += [Line(step.name, what, count, rates.get(key)) for what, count, key in _work(recipe, step)]
+    return lines
+
+
+def _work(recipe: Recipe, step: Step) -> Work:
+    """Return a step's work; stages that learn from drives are planned with drives of 30 s."""
+    seconds = round(_DRIVE_S * recipe.collect.episodes)
+    work: Work = []
+    if step.stage == "collect":
+        work = [("drives of the expert", recipe.collect.episodes, "drive")]
+    elif step.stage == "encoder":
+        frames = recipe.encoder.frames
+        work = [
+            ("pictures with labels", frames.count + frames.held if frames.count else 0, "render"),
+            ("pictures learned from", frames.count * recipe.encoder.epochs, "encoder"),
+        ]
+    elif step.stage == "sft":
+        work = _sft(recipe.sft, seconds)
+    elif step.stage == "imitate":
+        states = [("semantic states", seconds * recipe.imitate.states.draws, "kv")]
+        work = states if recipe.imitate.policy == TIC_VLA else []
+        work = [*work, ("samples learned", recipe.imitate.samples, "imitate")]
+    elif step.stage == "dagger":
+        expert = [("drives of the expert", recipe.dagger.expert_episodes, "drive")]
+        work = expert if recipe.dagger.expert_episodes else []
+        work = [*work, ("drives of the policy", recipe.dagger.episodes, "policy-drive")]
+    elif step.stage == "rl":
+        rl = recipe.rl
+        evaluations = 1 + -(-rl.iterations // rl.evaluate_every)
+        episodes = rl.iterations * rl.episodes + evaluations * rl.evaluate_episodes + 2 * rl.final_episodes
+        work = [("steps driven and learned from", episodes * _EPISODE_STEPS, "ppo")]
+    elif step.stage == "evaluate":
+        work = [("episodes", recipe.evaluate.episodes, "policy-drive")]
+    return _after_round(recipe, step.stage, work) if step.round and step.stage in GO_ON else work
+
+
+def _sft(config: SftConfig, seconds: int) -> Work:
+    deciding = 1 + _DECIDE * (config.deciding - 1)
+    anchors = round(seconds * (deciding * (1 + _RELABELLED * config.retold.ways))) * config.epochs
+    drives = [("frames encoded", seconds * RATE_HZ, "encode"), ("anchors learned", anchors, "sft")]
+    if not config.tours.count:
+        return drives
+    toured = round(_TOUR_S * config.tours.count)
+    return [
+        *drives,
+        (f"{_OF_TOURS}made", config.tours.count, "tour"),
+        (f"{_OF_TOURS}frames encoded", toured * (2 if config.mirrored > 0 else 1), "encode"),
+        (f"{_OF_TOURS}anchors learned", round(toured * deciding) * config.epochs, "sft"),
+    ]
+
+
+def _after_round(recipe: Recipe, stage: str, work: Sequence[tuple[str, int, str]]) -> Work:
+    """Return the work of a stage that continues after a DAgger round: caching new drives and training for a share."""
+    dagger = recipe.dagger
+    drives = dagger.episodes + dagger.expert_episodes
+    more = drives / recipe.collect.episodes
+    config = recipe.imitate if stage == "imitate" else recipe.sft
+    share = config.go_on_share or 1.0
+    # The length of an SFT epoch grows with the number of drives; imitation has a fixed number of samples.
+    shares = {"kv": more, "encode": more, "sft": share * (more if dagger.newest_only else 1.0)}
+    # No new tours; a share of them is trained on again.
+    tours = {"tour": 0.0, "encode": 0.0, "sft": share * recipe.sft.tours_again}
+    counts = (
+        (what, round(count * (tours if what.startswith(_OF_TOURS) else shares).get(key, share)), key)
+        for what, count, key in work
+    )
+    return [line for line in counts if line[1] > 0]
+
+
+def lines_of(recipe: Recipe, steps: Sequence[Step], budget: Sequence[Line], device: str) -> list[str]:
+    """Format the estimate as lines of text."""
+    lines = [f"{recipe.name}: network {recipe.model.name}, seed {recipe.seed}, {device}"]
+    for step in steps:
+        own = [line for line in budget if line.step == step.name]
+        for line in own:
+            took = "not measured" if line.seconds is None else duration(line.seconds)
+            lines.append(f"  {step.name:<11}{line.samples:>9,} {line.what:<28} {took}")
+        if not own:
+            lines.append(f"  {step.name:<11}{'':>9} no estimate")
+    known = sum(line.seconds for line in budget if line.seconds is not None)
+    open_ends = sum(line.seconds is None for line in budget)
+    lines.append(f"  total {duration(known)}{f' plus {open_ends} parts without a measured rate' if open_ends else ''}")
+    return lines
+
+
+def as_json(budget: Sequence[Line]) -> list[dict[str, Any]]:
+    """Return the estimate as the value that `--json` writes."""
+    keys = ("step", "what", "samples", "rate_per_s", "seconds")
+    return [dict(zip(keys, (*astuple(line), line.seconds), strict=True)) for line in budget]

@@ -16,31 +16,27 @@ from sim_hil.benchmark.results.summary import summarise
 from sim_hil.benchmark.runs import run_episodes
 from sim_hil.benchmark.suite.episode import load_suite, suite_to_toml
 from sim_hil.benchmark.workers.jobs import RunWatcher
-from sim_hil.scene.writer import scene_to_toml
-from tools.train.config.evaluate import EvaluateConfig
-from tools.train.config.scenes import SHARES
-from tools.train.run.exported import export_artifacts
+from sim_hil.scene.scene import scene_to_toml
+from tools.train.config.checks import TrainError
+from tools.train.config.collect import SHARES
+from tools.train.config.rl import EvaluateConfig
+from tools.train.drives.scenarios import training_episodes
 from tools.train.run.job import StageJob
-from tools.train.run.network_file import weights_before
-from tools.train.scenes.scenarios import training_episodes
+from tools.train.run.network_file import export_artifacts, weights_before
 
 STAGE: Final = "evaluate"
 SUITE: Final = "training.toml"
 
 
-class EvaluateError(ValueError):
-    """No policy to evaluate, or a suite of another configuration; one line."""
-
-
 def run(job: StageJob) -> dict[str, Any]:
     """Export the run's newest weights, drive the episodes and return the benchmark's summary. Resumes automatically.
 
-    Raises EvaluateError, ExportError, RunsError, ScenarioError, StoreError.
+    Raises TrainError, ExportError, RunsError, ScenarioError, StoreError.
     """
-    config = job.recipe.evaluate or EvaluateConfig()
+    config = job.recipe.evaluate
     weights = weights_before(job.run_dir.out, STAGE)
     if weights is None or weights.parent.name not in ("imitate", "rl"):
-        raise EvaluateError(f"{job.run_dir.out}: no policy to evaluate; run imitate first")
+        raise TrainError(f"{job.run_dir.out}: no policy to evaluate; run imitate first")
     folder = job.run_dir.stage(STAGE)
     artifacts = export_artifacts(weights, job.recipe.model, folder / "artifacts", job.progress.say)
     suite = write_suite(folder, config)
@@ -73,15 +69,13 @@ def run(job: StageJob) -> dict[str, Any]:
 def write_suite(folder: Path, config: EvaluateConfig) -> Path:
     """Write the episodes as a suite file with its scenes beside it, or reuse a file of the same configuration.
 
-    Returns its path. Raises EvaluateError for a file of another configuration, whose results would be mixed in.
+    Returns its path. Raises TrainError for a file of another configuration, whose results would be mixed in.
     """
     path, mark = folder / SUITE, (folder / SUITE).with_suffix(".json")
     numbers = {"episodes": config.episodes, "scenario_seed": config.scenario_seed, "kinds": dict(config.kinds)}
     if path.exists() and mark.exists():
         if (found := json.loads(mark.read_text(encoding="utf-8"))) != numbers:
-            raise EvaluateError(
-                f"{path}: expected episodes of {numbers}, found {found}; delete {folder} to start again"
-            )
+            raise TrainError(f"{path}: expected episodes of {numbers}, found {found}; delete {folder} to start again")
         return path
     scenes = folder / "scenes"
     scenes.mkdir(parents=True, exist_ok=True)

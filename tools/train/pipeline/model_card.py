@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from math import prod
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,14 +16,17 @@ from safetensors import safe_open
 from edge.core.cli import write_whole
 from export.model.network import PARTS
 from export.model.weights import WeightsInfo, save_weights
-from reporting.build_progress import duration
+from reporting.progress import duration
+from tools.train.config.checks import TrainError
 from tools.train.config.recipe import STAGES, Recipe
 from tools.train.drives.drive import file_sha256
 from tools.train.pipeline.chain import ADOPTED, GO_ON
 from tools.train.run.network_file import CARD, START, START_CARD, read_network, stage_weights
-from tools.train.run.own_drives import IMPORTED
-from tools.train.run.run_dir import VERSIONS, RunDir
+from tools.train.run.run_dir import IMPORTED, VERSIONS, RunDir
 
+_PART_NAMES: Final = dict(
+    zip(PARTS, ("vision encoder", "language model", "action expert", "value network"), strict=True)
+)
 _HEADINGS: Final = ("## ", "### ", "#### ", "##### ")  # Markdown has six levels
 _THEIRS: Final = "It began with weights of others (`--checkpoint`), whose licence holds for it."
 _BEFORE: Final = "## What it went on from"
@@ -50,17 +54,13 @@ LIMITS: Final = """\
 """
 
 
-class CardError(ValueError):
-    """No weights to describe, or an unreadable score file; one line."""
-
-
 def write_card(run_dir: RunDir, recipe: Recipe, scores: Sequence[Path] = ()) -> Path:
     """Write the card beside the run's weights and return its path. `scores`: result files of edge-bench.
 
-    Raises CardError, OSError.
+    Raises TrainError, OSError.
     """
     if not run_dir.model_path.is_file():
-        raise CardError(f"{run_dir.out}: no {run_dir.model_path.name} yet; train first")
+        raise TrainError(f"{run_dir.out}: no {run_dir.model_path.name} yet; train first")
     path = run_dir.out / CARD
     write_whole(path, card(run_dir, recipe, run_dir.model_path, [score(each) for each in scores]))
     return path
@@ -69,10 +69,10 @@ def write_card(run_dir: RunDir, recipe: Recipe, scores: Sequence[Path] = ()) -> 
 def ship(run_dir: RunDir, recipe: Recipe, folder: Path, scores: Sequence[Path] = ()) -> Path:
     """Write the run's weights for publication, with card and recipe: float16, without the value network.
 
-    Returns the weights' path. Raises CardError, NetworkFileError, OSError.
+    Returns the weights' path. Raises TrainError, OSError.
     """
     if not run_dir.model_path.is_file():
-        raise CardError(f"{run_dir.out}: no {run_dir.model_path.name} yet; train first")
+        raise TrainError(f"{run_dir.out}: no {run_dir.model_path.name} yet; train first")
     with safe_open(str(run_dir.model_path), framework="pt") as file:
         about = file.metadata()
     model = read_network(run_dir.model_path, recipe.model, recipe.seed).half()
@@ -123,12 +123,12 @@ def _licence(begun_with_weights: bool, before: str | None) -> str:
 
 
 def score(path: Path) -> dict[str, Any]:
-    """Read conditions and summary of a benchmark's result file. Raises CardError."""
+    """Read conditions and summary of a benchmark's result file. Raises TrainError."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         return {key: content[key] for key in ("suite", "conditions", "summary", "latency", "trained")}
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise CardError(f"--scores {path}: expected a result.json of edge-bench ({error!r})") from error
+        raise TrainError(f"--scores {path}: expected a result.json of edge-bench ({error!r})") from error
 
 
 def parameters(weights: Path) -> dict[str, int]:
@@ -136,23 +136,13 @@ def parameters(weights: Path) -> dict[str, int]:
     counts = dict.fromkeys(PARTS, 0)
     with safe_open(str(weights), framework="pt") as file:
         for name in file.keys():  # noqa: SIM118 — not a mapping
-            shape = file.get_slice(name).get_shape()
-            count = 1
-            for size in shape:
-                count *= size
-            counts[name.split(".")[0]] += count
+            counts[name.split(".")[0]] += prod(file.get_slice(name).get_shape())
     return counts
 
 
 def _network(weights: Path, recipe: Recipe, licence: str) -> str:
     counts, size = parameters(weights), weights.stat().st_size
-    named = {
-        "vision": "vision encoder",
-        "language": "language model",
-        "action": "action expert",
-        "value": "value network",
-    }
-    rows = "\n".join(f"| {named[part]} | {count:,} |" for part, count in counts.items() if count)
+    rows = "\n".join(f"| {_PART_NAMES[part]} | {count:,} |" for part, count in counts.items() if count)
     return (
         f"Network `{recipe.model.name}`: maps camera images, odometry and an English instruction to motion.\n"
         f"{licence}\n\n"
@@ -197,12 +187,8 @@ def _data(run_dir: RunDir, collected: Mapping[str, object] | None) -> str:
         lines += [*(_OUR_DRIVES if own else ()), "The expert's drives were not collected by this run."]
     for number, result in enumerate(rounds, 1):
         if result is not None and ADOPTED not in result:
-            lines += [
-                "",
-                f"DAgger round {number}, driven by the policy, relabelled by the expert:",
-                "",
-                *_facts(result),
-            ]
+            title = f"DAgger round {number}, driven by the policy, relabelled by the expert:"
+            lines += ["", title, "", *_facts(result)]
     return "\n".join(lines) + "\n"
 
 

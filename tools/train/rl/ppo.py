@@ -12,7 +12,6 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -22,9 +21,20 @@ from torch import Tensor
 from export.model.action import ActionExpert
 from export.model.network import TicVla
 from tools.train.config.rl import LOG_STD_RANGE, PpoConfig
-from tools.train.imitate.point_goal_net import PointGoalNet
-from tools.train.rl.action_tail import freeze_all_but_tail, load_tail, now_of, padded, tail, tail_parameters
-from tools.train.rl.command_policy import CommandLimits, arc_command, entropy, log_prob, within_limits
+from tools.train.imitate.trainable_policies import PointGoalNet
+from tools.train.rl.policies import (
+    CommandLimits,
+    arc_command,
+    entropy,
+    freeze_all_but_tail,
+    load_tail,
+    log_prob,
+    now_of,
+    padded,
+    tail,
+    tail_parameters,
+    within_limits,
+)
 from tools.train.rl.rollout import GOAL_SCALE_M, Rollout
 
 Array = npt.NDArray[np.float64]
@@ -54,37 +64,7 @@ def advantages(
     return found, found + values
 
 
-@dataclass(frozen=True)
-class Estimates:
-    """Advantage and return of every step of a rollout, [S] each."""
-
-    advantages: Tensor
-    returns: Tensor
-
-
 # Learners
-
-
-class ActorCritic(Protocol):
-    """A policy and a value function over the steps of a rollout; `rows` are step indices [B]."""
-
-    @property
-    def actor_parameters(self) -> Sequence[torch.nn.Parameter]:
-        """Parameters that are updated with `action_lr`."""
-        ...
-
-    @property
-    def critic_parameters(self) -> Sequence[torch.nn.Parameter]:
-        """Parameters that are updated with `value_lr`."""
-        ...
-
-    def act(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return log-probabilities [B] of the recorded actions, the mean entropy [] and a penalty [] for the loss."""
-        ...
-
-    def value(self, rows: Tensor) -> Tensor:
-        """Return the values [B] of the states."""
-        ...
 
 
 class Learner(ABC):
@@ -114,10 +94,6 @@ class Learner(ABC):
     def arcs(self, rows: Tensor) -> Tensor:
         """Compute the commands (v m/s, ω rad/s) [B, 2] of the steps' plans, before the robot's limits."""
 
-    def means(self, rows: Tensor) -> Tensor:
-        """Compute the mean commands (v m/s, ω rad/s) [B, 2] of steps, within the robot's limits."""
-        return within_limits(self.arcs(rows), self._limits)
-
     def penalty(self, rows: Tensor, arc: Tensor) -> Tensor:
         """Compute a penalty [] to add to the policy loss from the steps' `arcs`; zero unless overridden."""
         return arc.new_zeros(())
@@ -143,7 +119,10 @@ class Learner(ABC):
         self._tensors = {name: torch.from_numpy(array).to(device) for name, array in rollout.arrays.items()}
 
     def act(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """See `ActorCritic`. The penalty is computed only where gradients are."""
+        """Return log-probabilities [B] of the recorded actions, the mean entropy [] and a penalty [] for the loss.
+
+        `rows`: step indices [B]. The penalty is computed only where gradients are.
+        """
         arc = self.arcs(rows)
         mean = within_limits(arc, self._limits)
         log_std = self.log_std.clamp(*LOG_STD_RANGE)
@@ -151,13 +130,13 @@ class Learner(ABC):
         return log_prob(self._tensors["action"][rows], mean, log_std), entropy(log_std), penalty
 
     def value(self, rows: Tensor) -> Tensor:
-        """See `ActorCritic`."""
+        """Return the values [B] of the states of steps."""
         t = self._tensors
         values: Tensor = self.network.value(t["visual"][rows], t["state"][rows], t["goal"][rows])
         return values
 
-    def estimates(self, *, gamma: float, lam: float, reward_scale: float, batch: int = 256) -> Estimates:
-        """Estimate advantages and returns of the rollout with the current value network; rewards are scaled first."""
+    def estimates(self, *, gamma: float, lam: float, reward_scale: float, batch: int = 256) -> tuple[Tensor, Tensor]:
+        """Estimate advantages and returns [S] of the rollout with the current value network, after scaling rewards."""
         if self._rollout is None:
             raise RuntimeError("estimates: expected a rollout to be taken first")
         t, device = self._tensors, self.log_std.device
@@ -171,7 +150,7 @@ class Learner(ABC):
             found[steps], returns[steps] = advantages(
                 rewards[steps], values[steps], float(after[number]), terminal=end.terminal, gamma=gamma, lam=lam
             )
-        return Estimates(torch.from_numpy(found).float().to(device), torch.from_numpy(returns).float().to(device))
+        return torch.from_numpy(found).float().to(device), torch.from_numpy(returns).float().to(device)
 
 
 class TailLearner(Learner):
@@ -193,7 +172,7 @@ class TailLearner(Learner):
         return tail_parameters(self.network.action)
 
     def load_policy(self, tensors: Mapping[str, Tensor]) -> None:
-        """Replace the tail's weights. Raises ActionTailError for those of another network."""
+        """Replace the tail's weights. Raises TrainError for those of another network."""
         load_tail(self.network.action, tensors)
 
     def take(self, rollout: Rollout) -> None:
@@ -272,14 +251,14 @@ class PpoStats:
 class PpoOptimiser:
     """Two Adam optimisers: one for the policy, one for the value function."""
 
-    def __init__(self, learner: ActorCritic, config: PpoConfig) -> None:
+    def __init__(self, learner: Learner, config: PpoConfig) -> None:
         self.config = config
         self.actor = torch.optim.Adam(learner.actor_parameters, lr=config.action_lr)
         self.critic = torch.optim.Adam(learner.critic_parameters, lr=config.value_lr)
 
     def update(
         self,
-        learner: ActorCritic,
+        learner: Learner,
         advantages: Tensor,
         returns: Tensor,
         generator: torch.Generator,

@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -26,21 +26,32 @@ from export.model.network import initialise
 from export.model.weights import weights_sha256
 from sim_hil.benchmark.policies.select import robot_config
 from sim_hil.benchmark.results.bootstrap import paired_ci95
-from tools.train.config.recipe import Recipe
+from tools.train.config.checks import TrainError
+from tools.train.config.collect import TASKS_PER_SCENE
 from tools.train.config.rl import LOG_STD_RANGE, RlConfig
-from tools.train.config.scenes import TASKS_PER_SCENE
-from tools.train.imitate.point_goal_net import build_point_goal, save_point_goal
-from tools.train.rl.action_tail import check_tail
-from tools.train.rl.command_policy import CommandLimits
+from tools.train.drives.scenarios import KEPT_SEEDS
+from tools.train.imitate.trainable_policies import build_point_goal, save_point_goal
+from tools.train.rl.policies import CommandLimits, check_tail
 from tools.train.rl.ppo import Learner, PointGoalLearner, PpoOptimiser, TailLearner
 from tools.train.rl.rollout import Rollout
-from tools.train.rl.vector_env import drive
-from tools.train.rl.worker import RolloutOrder
-from tools.train.run import checkpoint
-from tools.train.run.exported import export_artifacts
+from tools.train.rl.worker import RolloutOrder, drive
 from tools.train.run.job import StageFailedError, StageJob
-from tools.train.run.network_file import START, finish_network, is_trained, read_network, weights_before
-from tools.train.scenes.scenarios import KEPT_SEEDS
+from tools.train.run.loop import (
+    load_checkpoint,
+    optimiser_tensors,
+    restore_optimiser,
+    save_checkpoint,
+    under,
+    with_prefix,
+)
+from tools.train.run.network_file import (
+    START,
+    export_artifacts,
+    finish_network,
+    is_trained,
+    read_network,
+    weights_before,
+)
 
 POINT_GOAL_FILE: Final = "point_goal.safetensors"
 # Seeds of scenarios that no other stage uses, for evaluation (selects the best), training and the final comparison.
@@ -49,25 +60,9 @@ _EVALUATION_TASKS: Final = 2  # per layout: more layouts are more informative th
 STAGE: Final = "rl"
 ROLLOUTS: Final = "rollouts"
 _ROUNDING: Final = 1e-9
-STEPS_PER_EPISODE: Final = 300
-"""Typical number (30 s at 10 Hz); used only to estimate a run's duration."""
-
-
-def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
-    """Return (description, number of samples, key of the throughput table) of this stage's work."""
-    config = recipe.rl
-    if config is None:
-        return []
-    evaluations = 1 + -(-config.iterations // config.evaluate_every)
-    episodes = config.iterations * config.episodes + evaluations * config.evaluate_episodes + 2 * config.final_episodes
-    return [("steps driven and learned from", episodes * STEPS_PER_EPISODE, "ppo")]
 
 
 Drive = Callable[..., Rollout]
-
-
-class RlError(ValueError):
-    """No policy to improve, or a checkpoint of another run; one line."""
 
 
 @dataclass(frozen=True)
@@ -95,16 +90,11 @@ class State:
         self._path, self._policy = folder / "checkpoint.safetensors", folder / "policy.safetensors"
         numbers = asdict(config)
         numbers.pop("jobs")
-        content = {
-            "rl": numbers,
-            "seed": job.seed,
-            "before": weights_sha256(learner.network),
-        }
+        content = {"rl": numbers, "seed": job.seed, "before": weights_sha256(learner.network)}
         self._key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
         self.iteration = 0
         self.steps = 0
-        self.first: Score | None = None
-        self.best: Score | None = None
+        self.first = self.best = Score(0.0, 0.0, 0.0)  # until the first evaluation
         self.improved = False
         """Whether the best policy differs from the first one."""
         self._kept: dict[str, dict[str, torch.Tensor]] = {}
@@ -112,7 +102,7 @@ class State:
     def write_policy(self) -> Path:
         """Write the current policy for the workers and return its path."""
         log_std = [float(v) for v in self._learner.log_std.detach().clamp(*LOG_STD_RANGE)]
-        checkpoint.save(self._policy, self._learner.policy_tensors(), {"log_std": log_std})
+        save_checkpoint(self._policy, self._learner.policy_tensors(), {"log_std": log_std})
         return self._policy
 
     def begin(self) -> None:
@@ -125,7 +115,6 @@ class State:
 
     def judge(self, score: Score) -> bool:
         """Keep a better policy as the best, or reset a much worse one to the best; return whether it was reset."""
-        assert self.best is not None
         if score.success - self.best.success > self._config.keep_margin + _ROUNDING:
             self.best, self.improved = score, True
             self._kept["best"] = self._learner.policy_tensors()
@@ -141,56 +130,52 @@ class State:
         """Write the checkpoint of the finished iteration."""
         learner, optimiser = self._learner, self.optimiser
         tensors = {
-            **checkpoint.with_prefix("policy", learner.policy_tensors()),
-            **checkpoint.with_prefix("start", self._kept["start"]),
-            **checkpoint.with_prefix("best", self._kept["best"]),
-            **checkpoint.with_prefix("value", learner.network.value.state_dict()),
-            **checkpoint.with_prefix("actor", checkpoint.optimiser_tensors(optimiser.actor)),
-            **checkpoint.with_prefix("critic", checkpoint.optimiser_tensors(optimiser.critic)),
+            **with_prefix("policy", learner.policy_tensors()),
+            **with_prefix("start", self._kept["start"]),
+            **with_prefix("best", self._kept["best"]),
+            **with_prefix("value", learner.network.value.state_dict()),
+            **with_prefix("actor", optimiser_tensors(optimiser.actor)),
+            **with_prefix("critic", optimiser_tensors(optimiser.critic)),
             "log_std": learner.log_std.detach(),
         }
-        scores = {name: asdict(score) for name in ("first", "best") if (score := getattr(self, name)) is not None}
-        meta = {"key": self._key, "iteration": self.iteration, "steps": self.steps, "improved": self.improved, **scores}
-        checkpoint.save(self._path, tensors, meta)
+        meta = {"key": self._key, "iteration": self.iteration, "steps": self.steps, "improved": self.improved}
+        meta |= {"first": asdict(self.first), "best": asdict(self.best)}
+        save_checkpoint(self._path, tensors, meta)
 
     def load(self) -> None:
-        """Resume from the checkpoint if requested and present. Raises RlError for another run's checkpoint."""
+        """Resume from the checkpoint if requested and present. Raises TrainError for another run's checkpoint."""
         if not (self._job.resume and self._path.exists()):
             self._job.run_dir.rewind(STAGE, -1)
             shutil.rmtree(self._path.parent / ROLLOUTS, ignore_errors=True)
             return
-        tensors, meta = checkpoint.load(self._path)
+        tensors, meta = load_checkpoint(self._path)
         if meta["key"] != self._key:
-            raise RlError(f"{self._path}: checkpoint of another policy or another recipe; delete it to start again")
+            raise TrainError(f"{self._path}: checkpoint of another policy or another recipe; delete it to start again")
         learner, optimiser = self._learner, self.optimiser
-        learner.load_policy(checkpoint.under("policy", tensors))
-        self._kept = {name: checkpoint.under(name, tensors) for name in ("start", "best")}
-        learner.network.value.load_state_dict(checkpoint.under("value", tensors))
-        checkpoint.restore_optimiser(optimiser.actor, checkpoint.under("actor", tensors))
-        checkpoint.restore_optimiser(optimiser.critic, checkpoint.under("critic", tensors))
+        learner.load_policy(under("policy", tensors))
+        self._kept = {name: under(name, tensors) for name in ("start", "best")}
+        learner.network.value.load_state_dict(under("value", tensors))
+        restore_optimiser(optimiser.actor, under("actor", tensors))
+        restore_optimiser(optimiser.critic, under("critic", tensors))
         learner.log_std.data.copy_(tensors["log_std"])
         self.iteration, self.steps, self.improved = int(meta["iteration"]), int(meta["steps"]), bool(meta["improved"])
-        self.first, self.best = _score(meta.get("first")), _score(meta.get("best"))
+        self.first, self.best = Score(**meta["first"]), Score(**meta["best"])
         self._job.run_dir.rewind(STAGE, self.iteration)
 
 
-def _score(content: Mapping[str, float] | None) -> Score | None:
-    return None if content is None else Score(**content)
-
-
 def run(job: StageJob) -> dict[str, Any]:
-    """Improve the newest weights of the run. Raises RlError, ActionTailError, RolloutFailedError, KeyboardInterrupt."""
+    """Improve the newest weights of the run. Raises TrainError, StageFailedError, KeyboardInterrupt."""
     if job.ranks.world > 1:
-        raise RlError(
+        raise TrainError(
             "torchrun: reinforcement learning starts its own processes (rl.jobs); run edge-train rl without torchrun"
         )
-    config = job.recipe.rl or RlConfig()
+    config = job.recipe.rl
     before = weights_before(job.run_dir.out, STAGE)
     if before is None:
-        raise RlError(f"{job.run_dir.out}: no policy to improve; run imitate first")
+        raise TrainError(f"{job.run_dir.out}: no policy to improve; run imitate first")
     imitated = before.parent.name == "imitate" or (before.parent.name == START and is_trained(before))
     if config.policy == "action" and not imitated:
-        raise RlError(f"{before}: the action expert is untrained; run imitate first")
+        raise TrainError(f"{before}: the action expert is untrained; run imitate first")
     network = read_network(before, job.recipe.model, job.recipe.seed)
     initialise(network, job.seed, ("value",))
     network.to(job.device)
@@ -222,7 +207,7 @@ def improve(
 
     The policy ends as the best one, or as the first one if the best is not ahead on the final scenarios.
     """
-    config = job.recipe.rl or RlConfig()
+    config = job.recipe.rl
     state = State(job, learner, config)
     orders = _Orders(job, config, before, artifacts)
     state.load()
@@ -245,7 +230,6 @@ def improve(
         job.progress.update(state.iteration, config.iterations, **numbers)
         state.save()
     final = _choose(job, config, orders, state, drive)
-    assert state.first is not None and state.best is not None
     return {
         "iterations": config.iterations,
         "steps": state.steps,
@@ -286,10 +270,10 @@ def _learn(job: StageJob, config: RlConfig, learner: Learner, state: State, roll
     state.steps += rollout.steps
     learner.take(rollout)
     ppo = config.ppo
-    found = learner.estimates(gamma=ppo.gamma, lam=ppo.gae_lambda, reward_scale=config.reward_scale)
+    advantages, returns = learner.estimates(gamma=ppo.gamma, lam=ppo.gae_lambda, reward_scale=config.reward_scale)
     generator = job.generator("ppo", state.iteration)
     warm = state.iteration >= config.warmup_iterations
-    stats = state.optimiser.update(learner, found.advantages, found.returns, generator, policy=warm)
+    stats = state.optimiser.update(learner, advantages, returns, generator, policy=warm)
     return {**numbers, **{key: float(value) for key, value in asdict(stats).items()}}
 
 

@@ -16,6 +16,8 @@ import numpy.typing as npt
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
+from tools.train.config.checks import TrainError
+
 FORMAT: Final = "tic-vla-edge-rollout/1"
 GOAL_SCALE_M: Final = 10.0
 """Unit of goal coordinates for the value network, m."""
@@ -23,10 +25,6 @@ GOAL_FARTHEST_M: Final = 40.0
 """Goals farther away are clipped to this distance for the value network, m."""
 
 Floats = npt.NDArray[np.float32]
-
-
-class RolloutError(ValueError):
-    """A rollout file that is incomplete or inconsistent; one line."""
 
 
 @dataclass(frozen=True)
@@ -60,47 +58,27 @@ class PolicyOutput:
 
 @dataclass
 class EpisodeSteps:
-    """Steps of one episode while it is driven; a step is one control period with a semantic state to act on."""
+    """Steps of one episode while it is driven; a step is one control period with a semantic state to act on.
 
-    visual: list[Floats] = field(default_factory=list)
-    """Visual tokens [N, D] of each step."""
-    queries: list[Floats] = field(default_factory=list)
-    """Queries [steps, hidden] of each step before the last layer; empty for a policy without such a layer."""
-    state: list[tuple[float, ...]] = field(default_factory=list)
-    latency: list[tuple[float, ...]] = field(default_factory=list)
-    goal: list[tuple[float, float]] = field(default_factory=list)
-    action: list[tuple[float, float]] = field(default_factory=list)
-    reward: list[float] = field(default_factory=list)
-    generation: list[int] = field(default_factory=list)
-    """Index into `semantic`."""
+    `rows` by name: `visual` tokens [N, D], `state`, `latency`, `goal`, `action`, `reward`, `generation` (index into
+    `semantic`) and, of a policy with frozen layers, `queries` [steps, hidden] before its last layer. `semantic`: tokens
+    [T, hidden] of each generation. `after`: `visual`, `state` and `goal` after the last step.
+    """
+
+    rows: dict[str, list[Any]] = field(default_factory=dict)
     semantic: list[Floats] = field(default_factory=list)
-    """Semantic tokens [T, hidden] of each generation."""
-    after_visual: Floats | None = None
-    after_state: tuple[float, ...] = (0.0, 0.0, 0.0)
-    after_goal: tuple[float, float] = (0.0, 0.0)
+    after: dict[str, Any] = field(default_factory=dict)
 
     def __len__(self) -> int:
-        return len(self.reward)
+        return len(self.rows.get("reward", ()))
 
-    def add(
-        self,
-        visual: Floats,
-        state: tuple[float, ...],
-        goal: tuple[float, float],
-        action: tuple[float, float],
-        reward: float,
-        chosen: PolicyOutput,
-    ) -> None:
-        """Append a step in which the policy acted."""
-        self.visual.append(visual)
-        self.state.append(state)
-        self.goal.append(goal)
-        self.action.append(action)
-        self.reward.append(reward)
-        self.latency.append(chosen.latency)
-        self.generation.append(chosen.generation)
+    def add(self, chosen: PolicyOutput, **values: Any) -> None:
+        """Append a step in which the policy acted; `values`: `visual`, `state`, `goal`, `action` and `reward`."""
+        values |= {"latency": chosen.latency, "generation": chosen.generation}
         if chosen.queries is not None:
-            self.queries.append(chosen.queries)
+            values["queries"] = chosen.queries
+        for name, value in values.items():
+            self.rows.setdefault(name, []).append(value)
 
 
 def goal_features(x_m: float, y_m: float) -> tuple[float, float]:
@@ -115,21 +93,15 @@ def save(path: Path, episodes: Sequence[tuple[EpisodeSteps, EpisodeEnd]]) -> Non
     driven = [steps for steps, _ in episodes if len(steps)]
     arrays: dict[str, npt.NDArray[Any]] = {}
     if driven:
-        arrays = {
-            "visual": np.stack([each for steps in driven for each in steps.visual]).astype(np.float32),
-            "state": _rows(driven, "state"),
-            "latency": _rows(driven, "latency"),
-            "goal": _rows(driven, "goal"),
-            "action": _rows(driven, "action"),
-            "reward": np.array([each for steps in driven for each in steps.reward], dtype=np.float32),
-            "generation": _generations(driven),
-            "after_visual": np.stack([_after(steps) for steps in driven]).astype(np.float32),
-            "after_state": np.array([steps.after_state for steps in driven], dtype=np.float32),
-            "after_goal": np.array([steps.after_goal for steps in driven], dtype=np.float32),
-        }
-        if driven[0].queries:
+        firsts = np.cumsum([0, *(len(steps.semantic) for steps in driven)])
+        for name in driven[0].rows:
+            arrays[name] = np.concatenate([np.array(steps.rows[name], np.float32) for steps in driven])
+        for name in ("visual", "state", "goal"):
+            arrays[f"after_{name}"] = np.array([steps.after[name] for steps in driven], np.float32)
+        numbers = [np.array(steps.rows["generation"], np.int64) for steps in driven]
+        arrays["generation"] = np.concatenate([each + first for each, first in zip(numbers, firsts, strict=False)])
+        if "queries" in arrays:
             semantic = [each for steps in driven for each in steps.semantic]
-            arrays["queries"] = np.stack([each for steps in driven for each in steps.queries]).astype(np.float32)
             arrays["semantic"] = np.concatenate(semantic).astype(np.float32)
             arrays["semantic_end"] = np.cumsum([len(each) for each in semantic]).astype(np.int64)
     ends = [asdict(end) for _, end in episodes]
@@ -162,7 +134,7 @@ class Rollout:
 
 
 def read(paths: Sequence[Path]) -> Rollout:
-    """Read the jobs' files as one rollout, in the order given. Raises RolloutError, OSError."""
+    """Read the jobs' files as one rollout, in the order given. Raises TrainError, OSError."""
     parts: list[dict[str, npt.NDArray[Any]]] = []
     semantic: list[Floats] = []
     ends: list[EpisodeEnd] = []
@@ -178,7 +150,7 @@ def read(paths: Sequence[Path]) -> Rollout:
         parts.append(arrays)
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else {}
     if joined and sum(end.steps for end in ends) != len(joined["reward"]):
-        raise RolloutError(f"rollout {paths[0].parent}: the number of steps differs from the sum over its episodes")
+        raise TrainError(f"rollout {paths[0].parent}: the number of steps differs from the sum over its episodes")
     return Rollout(joined, tuple(semantic), tuple(ends))
 
 
@@ -187,26 +159,8 @@ def _read(path: Path) -> tuple[dict[str, npt.NDArray[Any]], list[EpisodeEnd]]:
         with safe_open(str(path), framework="np") as file:
             header = file.metadata() or {}
             if header.get("format") != FORMAT:
-                raise RolloutError(f"rollout {path}: expected format {FORMAT}, found {header.get('format')}")
+                raise TrainError(f"rollout {path}: expected format {FORMAT}, found {header.get('format')}")
             ends = [EpisodeEnd(**end) for end in json.loads(header["ends"])]
             return {name: file.get_tensor(name) for name in file.keys()}, ends  # noqa: SIM118 — not a mapping
     except (SafetensorError, KeyError, TypeError, ValueError) as error:
-        if isinstance(error, RolloutError):
-            raise
-        raise RolloutError(f"rollout {path}: not readable ({error})") from error
-
-
-def _rows(driven: Sequence[EpisodeSteps], name: str) -> Floats:
-    return np.array([row for steps in driven for row in getattr(steps, name)], dtype=np.float32)
-
-
-def _generations(driven: Sequence[EpisodeSteps]) -> npt.NDArray[np.int64]:
-    numbers, before = [], 0
-    for steps in driven:
-        numbers += [before + number for number in steps.generation]
-        before += len(steps.semantic)
-    return np.array(numbers, dtype=np.int64)
-
-
-def _after(steps: EpisodeSteps) -> Floats:
-    return steps.visual[-1] if steps.after_visual is None else steps.after_visual
+        raise TrainError(f"rollout {path}: not readable ({error})") from error

@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import sys
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,26 +25,33 @@ import torch
 from edge.artifacts.manifest import load_artifacts
 from edge.core.geometry import SE2
 from edge.motion.controller import grown, scale_to_limits
-from export.model.config_file import config_from_dict
+from export.model.config import config_from_dict
 from export.model.network import TicVla
 from firmware_bridge.core.config import LimitsConfig
 from sim_hil.benchmark.conditions.latency import LatencyProfile, LatencySampler
 from sim_hil.benchmark.env.gym_env import DynaNavEnv
 from sim_hil.benchmark.env.world import EpisodeWorld
 from sim_hil.benchmark.policies.select import robot_config
+from sim_hil.benchmark.workers.worker_pool import WorkerJob, Workers
 from sim_hil.benchmark.workers.worker_process import worker_main
 from sim_hil.processes.child_process import Message
-from tools.train.config.scenes import TASKS_PER_SCENE
-from tools.train.imitate.point_goal_net import PointGoalNet
+from tools.train.config.collect import TASKS_PER_SCENE
+from tools.train.drives.scenarios import FIRST_SEED, Scenario, training_episodes
+from tools.train.imitate.trainable_policies import PointGoalNet
 from tools.train.rl import rollout
-from tools.train.rl.action_tail import check_tail, load_tail
-from tools.train.rl.command_policy import CommandLimits
-from tools.train.rl.policies import PointGoalRolloutPolicy, RolloutPolicy, TailPolicy
-from tools.train.rl.rollout import EpisodeEnd, EpisodeSteps, goal_features
-from tools.train.rl.virtual_time_reasoner import Models
-from tools.train.run import checkpoint
+from tools.train.rl.policies import (
+    CommandLimits,
+    Models,
+    PointGoalRolloutPolicy,
+    RolloutPolicy,
+    TailPolicy,
+    check_tail,
+    load_tail,
+)
+from tools.train.rl.rollout import EpisodeEnd, EpisodeSteps, Rollout, goal_features, read
+from tools.train.run.job import StageFailedError
+from tools.train.run.loop import load_checkpoint
 from tools.train.run.network_file import read_network
-from tools.train.scenes.scenarios import FIRST_SEED, Scenario, training_episodes
 
 MODULE: Final = "tools.train.rl.worker"
 _TAG, _CROWD, _DELAYS = 0x71, 0xC0, 0xDE
@@ -100,7 +108,7 @@ def messages(content: Message) -> Iterator[Message]:
     order = RolloutOrder.of_json(content)
     limits = robot_config().limits
     network = read_network(Path(order.network), config_from_dict(order.model), order.network_seed).eval()
-    tensors, meta = checkpoint.load(Path(order.policy))
+    tensors, meta = load_checkpoint(Path(order.policy))
     log_std = (float(meta["log_std"][0]), float(meta["log_std"][1])) if order.explore else None
     options = DriveOptions(network.config.vision.image_px, log_std, order.drift, order.max_s)
     policies = _tail_policies(order, network, tensors) if order.artifacts else _point_goal_policies(network, tensors)
@@ -220,15 +228,16 @@ def drive_episode(
             _, reward, ended, timed_out, _ = env.step(np.array(limiter.limit(*action, scale), np.float32))
             total += reward
             if chosen is not None:
-                steps.add(visual[0], state, goal_features(*goal_m), action, reward, chosen)
+                goal = goal_features(*goal_m)
+                steps.add(chosen, visual=visual[0], state=state, goal=goal, action=action, reward=reward)
             here = env.world.pose()
             recent_xy.append((here.x_m, here.y_m))
             cut = "no-reasoning" if policy.failure is not None else "stuck" if _is_stuck(recent_xy) else ""
         if not env.world.done:
             env.world.stop()
-        time_s, image, steps.after_state, T_odom_base = _observation(env.world)
-        steps.after_visual = policy.observe(time_s, image, T_odom_base)[0]
-        steps.after_goal = goal_features(*_goal_m(env.world.pose(), episode.goal_xy))
+        time_s, image, state, T_odom_base = _observation(env.world)
+        goal = goal_features(*_goal_m(env.world.pose(), episode.goal_xy))
+        steps.after = {"visual": policy.observe(time_s, image, T_odom_base)[0], "state": state, "goal": goal}
         steps.semantic = list(policy.semantic)
         outcome = env.world.outcome()
     finally:
@@ -297,6 +306,55 @@ def _is_stuck(recent_xy: deque[tuple[float, float]]) -> bool:
         return False
     xy = np.array(recent_xy)
     return float(np.hypot(*(xy - xy[-1]).T).max()) < STUCK_M
+
+
+COMMAND: Final[Sequence[str]] = (sys.executable, "-m", MODULE)
+
+
+def split(order: RolloutOrder, per_job: int) -> list[RolloutOrder]:
+    """Split an order into orders of at most `per_job` episodes, each with its own file below `order.out`.
+
+    Each part keeps the position of its episodes in the whole order, so that every episode has its own random seed.
+    """
+    return [
+        replace(
+            order,
+            numbers=order.numbers[first : first + per_job],
+            first=order.first + first,
+            out=str(Path(order.out) / f"{first // per_job:03d}.safetensors"),
+        )
+        for first in range(0, len(order.numbers), per_job)
+    ]
+
+
+def drive(
+    order: RolloutOrder,
+    *,
+    jobs: int,
+    per_job: int,
+    finished: Callable[[bool], None] = lambda success: None,
+    stopped: Callable[[], bool] = lambda: False,
+    command: Sequence[str] = COMMAND,
+) -> Rollout:
+    """Drive an order's episodes; files of jobs that have finished before are reused.
+
+    `finished` takes for each episode whether it succeeded. The number of jobs does not change the result. Raises
+    StageFailedError, KeyboardInterrupt when `stopped`.
+    """
+    folder = Path(order.out)
+    folder.mkdir(parents=True, exist_ok=True)
+    orders = split(order, per_job)
+    missing = [part for part in orders if not Path(part.out).is_file()]
+    waiting = deque(
+        WorkerJob(Path(part.out).stem, part.to_json(), Path(part.out).with_suffix(".log")) for part in missing
+    )
+    with Workers(command, jobs) as workers:
+        for event in chain.from_iterable(workers.run(waiting, stopped)):
+            if event.message is not None:
+                finished(bool(event.message["success"]))
+            elif event.failure:
+                raise StageFailedError(f"rollout {event.key}: {event.failure}")
+    return read([Path(part.out) for part in orders])
 
 
 if __name__ == "__main__":

@@ -1,1 +1,1 @@
-"""Folder and processes of a training run: stage jobs, ranks, checkpoints, optimiser, weights between stages."""
+"""Folder and processes of a training run: stage jobs, ranks, the training loop, weights between stages."""

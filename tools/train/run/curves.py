@@ -6,9 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-
+from reporting.plot_style import new_figure, png, tidy
 from tools.train.run.run_dir import RunDir
 
 Series = dict[str, list[tuple[int, float]]]
@@ -58,8 +56,7 @@ _RATES: Final = ("success", "accuracy", "share", "collided", "recall", "precisio
 def draw(title: str, series: Mapping[str, Sequence[tuple[int, float]]], path: Path) -> None:
     """Draw one plot as a PNG file that depends on the values alone."""
     panels = panels_of(list(series))
-    figure = Figure(figsize=(8.0, 1.0 + 2.2 * len(panels)), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(8.0, 1.0 + 2.2 * len(panels))
     axes = figure.subplots(len(panels), 1, squeeze=False, sharex=True)[:, 0]
     for axis, names in zip(axes, panels, strict=True):
         for name, colour in zip(names, COLOURS * (1 + len(names) // len(COLOURS)), strict=False):
@@ -72,11 +69,11 @@ def draw(title: str, series: Mapping[str, Sequence[tuple[int, float]]], path: Pa
         drawn = [value for name in names for _, value in series[name]]
         if "loss" in names[0] and min(drawn) > 0 and max(drawn) > LOG_RATIO * min(drawn):
             axis.set_yscale("log")
-        axis.grid(color="#dfe4e9", linewidth=0.6)
+        tidy(axis)
         axis.legend(loc="best", fontsize=8, frameon=False)
     axes[0].set_title(title)
     axes[-1].set_xlabel("step")
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    path.write_bytes(png(figure))
 
 
 def smoothed(values: Sequence[float]) -> list[float]:

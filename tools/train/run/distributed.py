@@ -9,9 +9,10 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from datetime import timedelta
+from functools import cache
 from typing import Any, Final, NoReturn
 
 import numpy as np
@@ -52,7 +53,8 @@ class Ranks:
         if self.world == 1:
             return weight
         total = self.sum(weight)
-        flat = torch.cat([_gradient(each).reshape(-1).float() for each in parameters]) * (weight / max(total, 1e-12))
+        own = [each.grad if each.grad is not None else torch.zeros_like(each) for each in parameters]
+        flat = torch.cat([each.reshape(-1).float() for each in own]) * (weight / max(total, 1e-12))
         dist.all_reduce(flat)
         start = 0
         for each in parameters:
@@ -64,7 +66,7 @@ class Ranks:
         """Return the sum of a value over the ranks."""
         if self.world == 1:
             return value
-        whole = torch.tensor([value], dtype=torch.float64, device=_device())
+        whole = torch.tensor([value], dtype=torch.float64, device="cuda" if dist.get_backend() == "nccl" else "cpu")
         dist.all_reduce(whole)
         return float(whole.item())
 
@@ -172,9 +174,16 @@ class BatchOrder:
         return order[within * self.batch : (within + 1) * self.batch].astype(np.int64)
 
 
-def _gradient(parameter: torch.nn.Parameter) -> torch.Tensor:
-    return parameter.grad if parameter.grad is not None else torch.zeros_like(parameter)
+def autocast(device: str, bf16: bool) -> AbstractContextManager[object]:
+    """Return a context for bfloat16 if `bf16` is set and the device supports it, else for float32."""
+    kind = torch.device(device).type
+    return torch.autocast(kind, dtype=torch.bfloat16) if bf16 and computes_bf16(kind) else nullcontext()
 
 
-def _device() -> str:
-    return "cuda" if dist.get_backend() == "nccl" else "cpu"
+@cache
+def computes_bf16(device: str) -> bool:
+    """Return whether the device has bfloat16 instructions: emulation takes twelve times as long as float32."""
+    if torch.device(device).type != "cpu":
+        return True
+    found = torch.cpu.get_capabilities()
+    return any(found.get(name, False) for name in ("avx512_bf16", "amx_bf16", "bf16"))

@@ -1,9 +1,8 @@
-"""The interface of a stage: `StageJob` with recipe, folder, device, seed, ranks and progress display."""
+"""The interface of a stage, `StageJob`, and its progress display: a bar on a terminal, otherwise lines."""
 
 from __future__ import annotations
 
-import sys
-import time
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from typing import Protocol
 from zlib import crc32
@@ -11,7 +10,7 @@ from zlib import crc32
 import numpy as np
 import torch
 
-from reporting.build_progress import duration
+from reporting.progress import Progress
 from tools.train.config.recipe import Recipe
 from tools.train.run.distributed import SINGLE, Ranks
 from tools.train.run.run_dir import RunDir
@@ -41,46 +40,11 @@ class QuietProgress:
         """Nothing to do."""
 
 
-class PlainProgress:
-    """Progress as lines on standard error, at most one per `period_s`."""
-
-    def __init__(self, stage: str, period_s: float = 15.0) -> None:
-        self._stage = stage
-        self._period_s = period_s
-        self._shown_ns = time.monotonic_ns()
-        self._began: tuple[int, int, int] | None = None
-        """Total, first count and start of the current work, ns: a stage may have several parts."""
-        self._last = 0
-
-    def update(self, done: int, total: int, **numbers: float) -> None:
-        """Write a line if the last one is at least `period_s` old, or if the work is done."""
-        now_ns = time.monotonic_ns()
-        if self._began is None or self._began[0] != total or done < self._last:
-            self._began, self._last = (total, done, now_ns), -1
-        due = (now_ns - self._shown_ns) / 1e9 >= self._period_s
-        if done == self._last or not (due or done >= total):
-            return
-        self._shown_ns, self._last = now_ns, done
-        _, first, since_ns = self._began
-        rate = (done - first) / max((now_ns - since_ns) / 1e9, 1e-9)
-        values = "".join(f", {name} {value:.4g}" for name, value in numbers.items())
-        left = f", {duration((total - done) / rate)} to go" if rate > 0 and done < total else ""
-        self.say(f"{done} of {total} ({rate:.3g} /s{left}){values}")
-
-    def say(self, line: str) -> None:
-        """Write one line."""
-        sys.stderr.write(f"edge-train: {self._stage}: {line}\n")
-
-
+@dataclass
 class StopFlag:
-    """A flag that a signal handler sets and a stage reads between steps."""
+    """A flag that a signal handler sets: the running stage ends at its next step, with a checkpoint."""
 
-    def __init__(self) -> None:
-        self.asked = False
-
-    def ask(self) -> None:
-        """Request that the running stage ends at its next step, with a checkpoint."""
-        self.asked = True
+    asked: bool = False
 
 
 @dataclass(frozen=True)
@@ -101,7 +65,8 @@ class StageJob:
 
     def rng(self, *tags: int | str) -> np.random.Generator:
         """Return a numpy generator for this stage's seed and `tags`."""
-        return np.random.default_rng((self.seed, *map(_number, tags)))
+        numbers = (tag if isinstance(tag, int) else crc32(tag.encode()) for tag in tags)
+        return np.random.default_rng((self.seed, *numbers))
 
     def generator(self, *tags: int | str) -> torch.Generator:
         """Return a torch generator on the CPU for this stage's seed and `tags`."""
@@ -116,5 +81,14 @@ class StageJob:
         return self.ranks.any(self.stop.asked)
 
 
-def _number(tag: int | str) -> int:
-    return tag if isinstance(tag, int) else crc32(tag.encode())
+class StageDisplay(Progress):
+    """Progress with the newest values; a `StageProgress`."""
+
+    def update(self, done: int, total: int, **numbers: float) -> None:
+        """Report `done` of `total` units of work, with values to show."""
+        self.show(", ".join(f"{name} {value:.4g}" for name, value in numbers.items()), done, total)
+
+
+def progress_for(stage: str, *, quiet: bool = False) -> AbstractContextManager[StageProgress]:
+    """Return the progress display of a stage; with `quiet` one that shows nothing."""
+    return nullcontext(QuietProgress()) if quiet else StageDisplay(f"edge-train: {stage}: ", bar=True)

@@ -1,21 +1,26 @@
-"""Weights between stages: each stage starts with those of the previous one and writes its own."""
+"""Weights between stages, and their export: each stage starts with those of the previous one and writes its own."""
 
 from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from safetensors import SafetensorError, safe_open
 
+from edge.artifacts.files import MANIFEST_NAME
+from edge.core.cli import EXIT_DONE, EXIT_INTERRUPTED, write_whole
 from export.checkpoint.load import load_checkpoint
-from export.model.config import ActionConfig, ModelConfigError, TicVlaConfig
-from export.model.config_file import config_from_dict
+from export.model.config import PRESETS, ActionConfig, ModelConfigError, TicVlaConfig, config_from_dict
 from export.model.network import PARTS, TicVla, build
 from export.model.weights import WeightsInfo, save_weights
+from sim_hil.processes.child_process import last_lines
+from tools.train.config.checks import TrainError
 from tools.train.drives.drive import file_sha256
 from tools.train.run.job import StageJob
 
@@ -30,10 +35,6 @@ ORDER: Final = (START, "encoder", "sft", "imitate", "rl")
 FILE: Final = "model.safetensors"
 SHARED: Final = ("vision", "language")
 """Parts that ablations of the action expert share."""
-
-
-class NetworkFileError(ValueError):
-    """Weights that a stage cannot start with; one line: what, expected, found."""
 
 
 def stage_weights(out: Path, stage: str) -> Path:
@@ -95,18 +96,18 @@ def card_of(weights: Path) -> str | None:
 
 
 def is_trained(weights: Path) -> bool:
-    """Return whether the whole network in a file was trained. Raises NetworkFileError."""
+    """Return whether the whole network in a file was trained. Raises TrainError."""
     try:
         with safe_open(str(weights), framework="pt") as file:
             return (file.metadata() or {}).get("trained") == "true"
     except (OSError, SafetensorError) as error:
-        raise NetworkFileError(f"{weights}: not weights of edge-train ({error})") from error
+        raise TrainError(f"{weights}: not weights of edge-train ({error})") from error
 
 
 def start_network(job: StageJob, stage: str) -> TicVla:
     """Load the network of the previous stage, or initialise one from the recipe's seed; on the CPU.
 
-    Raises NetworkFileError for weights of another network.
+    Raises TrainError for weights of another network.
     """
     path = weights_before(job.run_dir.out, stage)
     if path is None:
@@ -119,7 +120,7 @@ def read_network(path: Path, config: TicVlaConfig, seed: int) -> TicVla:
 
     The action expert's inputs do not count as configuration: ablations of them start with the same weights.
 
-    Raises NetworkFileError if encoder or language model differ.
+    Raises TrainError if encoder or language model differ.
     """
     model = build(config, seed)
     try:
@@ -128,16 +129,14 @@ def read_network(path: Path, config: TicVlaConfig, seed: int) -> TicVla:
             theirs, ours = (replace(of, action=_with_all_inputs(of.action)) for of in (found, config))
             same = [part for part in PARTS if getattr(theirs, part) == getattr(ours, part)]
             if other := sorted(set(SHARED) - set(same)):
-                raise NetworkFileError(f"{path}: its {other[0]} differs from the recipe's; train from the first stage")
+                raise TrainError(f"{path}: its {other[0]} differs from the recipe's; train from the first stage")
             tensors = {name: file.get_tensor(name) for name in file.keys() if name.split(".")[0] in same}  # noqa: SIM118
     except (OSError, SafetensorError, KeyError, ValueError, ModelConfigError) as error:
-        if isinstance(error, NetworkFileError):
-            raise
-        raise NetworkFileError(f"{path}: not weights of edge-train ({error})") from error
+        raise TrainError(f"{path}: not weights of edge-train ({error})") from error
     wanted = {name for name in model.state_dict() if name.split(".")[0] in same}
     if set(tensors) != wanted:
         odd = sorted(set(tensors) ^ wanted)
-        raise NetworkFileError(f"{path}: expected the tensors of {', '.join(same)}; {odd[0]} is missing or unknown")
+        raise TrainError(f"{path}: expected the tensors of {', '.join(same)}; {odd[0]} is missing or unknown")
     model.load_state_dict(tensors, strict=False)
     return model
 
@@ -151,3 +150,49 @@ def finish_network(job: StageJob, stage: str, model: TicVla) -> Path:
     shutil.copyfile(path, partial)
     partial.replace(job.run_dir.model_path)
     return path
+
+
+TARGET: Final = "cpu"
+COMMAND: Final[Sequence[str]] = (sys.executable, "-m", "export.cli")
+
+
+class ExportError(RuntimeError):
+    """Weights that could not be exported; one line."""
+
+
+def export_artifacts(
+    weights: Path,
+    config: TicVlaConfig,
+    out: Path,
+    say: Callable[[str], None] = lambda line: None,
+    command: Sequence[str] = COMMAND,
+) -> Path:
+    """Export into `out`, unless it contains these weights, and return it. Raises ExportError, KeyboardInterrupt."""
+    digest, mark = file_sha256(weights), out.with_name(out.name + ".json")
+    if (out / MANIFEST_NAME).is_file() and mark.is_file():
+        if json.loads(mark.read_text(encoding="utf-8")).get("weights_sha256") == digest:
+            return out
+        mark.unlink()
+    out.parent.mkdir(parents=True, exist_ok=True)
+    arguments = ["--target", TARGET, "--model", model_argument(config, out), "--checkpoint", str(weights)]
+    say(f"exporting the weights of stage {weights.parent.name}")
+    log = out.with_name(out.name + ".log")
+    with log.open("wb") as output:
+        code = subprocess.run([*command, *arguments, "--out", str(out)], stdout=output, stderr=output, check=False)
+    if code.returncode == EXIT_INTERRUPTED:
+        raise KeyboardInterrupt
+    if code.returncode != EXIT_DONE:
+        lines = last_lines(log) or [f"see {log}"]
+        raise ExportError(f"{weights}: edge-export ended with {code.returncode}: {lines[-1]}")
+    write_whole(mark, json.dumps({"weights_sha256": digest}) + "\n")
+    return out
+
+
+def model_argument(config: TicVlaConfig, out: Path) -> str:
+    """Return the value of `--model`: a preset's name, or the path of a file that is written beside `out`."""
+    for name, preset in PRESETS.items():
+        if preset == config:
+            return name
+    path = out.with_name(out.name + ".model.json")
+    write_whole(path, json.dumps(config.to_dict(), indent=1) + "\n")
+    return str(path)

@@ -1,4 +1,4 @@
-"""The folder of a training run: recipe, versions, one folder per stage, the log and the weights."""
+"""The folder of a training run: recipe, versions, one folder per stage, the log, the weights, and the run's drives."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import platform
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
@@ -14,8 +15,11 @@ from typing import Any, Final
 from edge.core.cli import write_whole
 from export import model
 from sim_hil.benchmark.workers.code_version import code_sha256
+from tools.train.config.checks import TrainError
 from tools.train.config.recipe import STAGES, Recipe, load_recipe
-from tools.train.run.optim import computes_bf16
+from tools.train.drives.dataset import DatasetWriter
+from tools.train.drives.drive import Dataset
+from tools.train.run.distributed import computes_bf16
 
 VERSIONS: Final = "versions.json"
 TIMINGS: Final = "timings.json"
@@ -25,30 +29,28 @@ PACKAGES: Final = ("numpy", "torch", "onnxruntime", "opencv-python-headless", "t
 """Packages whose versions affect a run's result."""
 
 
-class RunDirError(ValueError):
-    """A folder that is not the requested run; one line: what, expected, found."""
-
-
 class RunDir:
     """`out/{recipe.toml,versions.json,timings.json,collect/,…,model.safetensors,curves/*.png,log.jsonl}`."""
 
     def __init__(self, out: Path) -> None:
         self.out = out
+        self.recipe_path, self.model_path = out / "recipe.toml", out / "model.safetensors"
+        self.log_path, self.curves = out / "log.jsonl", out / "curves"
 
     @staticmethod
     def open(out: Path, recipe: Recipe) -> RunDir:
-        """Create the folder or reopen the run in it. Raises RunDirError if it contains another run.
+        """Create the folder or reopen the run in it. Raises TrainError if it contains another run.
 
         The configuration of a stage that has not started may still be changed.
         """
         run_dir = RunDir(out)
         if run_dir.recipe_path.exists():
             if changed := run_dir._changed(recipe):
-                raise RunDirError(
+                raise TrainError(
                     f"{out}: was started with another recipe ({changed}); name another --out, or restore the values"
                 )
         elif out.exists() and (not out.is_dir() or any(out.iterdir())):
-            raise RunDirError(f"{out}: expected a new or empty directory, or a run folder of edge-train")
+            raise TrainError(f"{out}: expected a new or empty directory, or a run folder of edge-train")
         out.mkdir(parents=True, exist_ok=True)
         run_dir._note_versions()
         write_whole(run_dir.recipe_path, recipe.to_toml())
@@ -85,18 +87,18 @@ class RunDir:
         return folder.is_dir() and any(folder.iterdir())
 
     def borrow(self, other: RunDir, stages: Sequence[str], recipe: Recipe) -> None:
-        """Link finished stages of another run. Raises RunDirError if this recipe would give other results."""
+        """Link finished stages of another run. Raises TrainError if this recipe would give other results."""
         if not other.recipe_path.exists():
-            raise RunDirError(f"--from {other.out}: not a run folder of edge-train")
+            raise TrainError(f"--from {other.out}: not a run folder of edge-train")
         found, asked = load_recipe(str(other.recipe_path)).to_tables(), recipe.to_tables()
         for stage in stages:
             if other.result(stage) is None:
-                raise RunDirError(f"--from {other.out}: stage {stage} has not finished")
+                raise TrainError(f"--from {other.out}: stage {stage} has not finished")
             if difference := _difference(stage, found[stage], asked[stage]):
-                raise RunDirError(f"--from {other.out}: was trained with another recipe ({difference})")
+                raise TrainError(f"--from {other.out}: was trained with another recipe ({difference})")
         for part in SHARED_PARTS:
             if difference := _difference(f"model.{part}", found["model"][part], asked["model"][part]):
-                raise RunDirError(f"--from {other.out}: its {part} differs ({difference})")
+                raise TrainError(f"--from {other.out}: its {part} differs ({difference})")
         for stage in stages:
             link = self.out / stage
             if not link.exists():
@@ -119,26 +121,6 @@ class RunDir:
         while self.begun(f"{stage}-{number}"):
             number += 1
         return number
-
-    @property
-    def recipe_path(self) -> Path:
-        """Path of the run's recipe with all values."""
-        return self.out / "recipe.toml"
-
-    @property
-    def model_path(self) -> Path:
-        """Path of the network's weights after the last finished stage."""
-        return self.out / "model.safetensors"
-
-    @property
-    def log_path(self) -> Path:
-        """Path of the log, one JSON object per line: `{"stage", "step", values…}`."""
-        return self.out / "log.jsonl"
-
-    @property
-    def curves(self) -> Path:
-        """Folder of the plots."""
-        return self.out / "curves"
 
     def stage(self, name: str) -> Path:
         """Return the folder of a stage; create it if needed."""
@@ -225,3 +207,51 @@ def _training_sha256() -> str:
             digest.update(f"{root.name}/{path.relative_to(root).as_posix()}\0".encode())
             digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+_PARTIAL: Final = "collect.partial"
+IMPORTED: Final = "imported"
+"""Key in the result of `collect`: the drives were imported."""
+
+
+def prefixes_of(round_number: int) -> tuple[str, str]:
+    """Return the id prefixes of a round's drives, the policy's and the expert's; rounds count from 1."""
+    return f"d{round_number}-", f"n{round_number}-"
+
+
+def drives_after(run_dir: RunDir, recipe: Recipe, stage: str) -> Dataset:
+    """Return the drives that a stage trains on: all, or those of the newest round (`dagger.newest_only`)."""
+    dataset, rounds = Dataset.open(run_dir.stage("collect")), run_dir.retired(stage)
+    return dataset.of(*prefixes_of(rounds)) if rounds and recipe.dagger.newest_only else dataset
+
+
+def take_drives(run_dir: RunDir, folder: Path) -> dict[str, Any]:
+    """Import the data set in `folder` as the result of the run's stage `collect`; files are hard-linked if possible.
+
+    An interrupted call leaves no drives. Returns the stage's result. Raises TrainError for a damaged data set
+    or if the run has other drives.
+    """
+    dataset = Dataset.open(folder)
+    done = run_dir.result("collect")
+    if done is not None and done.get(IMPORTED) is True and done["sha256"] == dataset.sha256:
+        return done
+    if run_dir.begun("collect"):
+        raise TrainError(f"--drives {folder}: {run_dir.out} has other drives; name another --out")
+    Dataset.open(folder, verify=True)
+    partial = run_dir.out / _PARTIAL
+    shutil.rmtree(partial, ignore_errors=True)
+    with DatasetWriter(partial) as writer:
+        for entry in dataset.entries:
+            _link_or_copy(dataset.path(entry.id).resolve(), writer.path(entry.id))
+            writer.add(entry)
+        result = {IMPORTED: True, **writer.summary(""), "sha256": writer.finish().sha256}
+    run_dir.finish(_PARTIAL, result)
+    partial.replace(run_dir.out / "collect")
+    return result
+
+
+def _link_or_copy(source: Path, target: Path) -> None:
+    try:
+        os.link(source, target)
+    except OSError:  # another file system, or one without hard links
+        shutil.copyfile(source, target)

@@ -25,7 +25,7 @@ Array = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Around:
-    """Walls around the robot in g frames (`tools.train.scenes.walls`), ground truth that no policy receives.
+    """Walls around the robot in g frames (`tools.train.drives.walls`), ground truth that no policy receives.
 
     `patches` f16 [g, rows, columns], clearance in m; `body` f32 [g, 2], reach and radius in m.
     """

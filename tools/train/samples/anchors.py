@@ -36,7 +36,7 @@ from export.model.config import TicVlaConfig
 from tools.train.config.collect import RATE_HZ, TRACE_EVERY
 from tools.train.config.sft import AROUND, DrawConfig
 from tools.train.drives.drive import Drive
-from tools.train.scenes.trace_sentences import aspects_of_json
+from tools.train.drives.trace_sentences import aspects_of_json
 
 FRAME_OFFSETS_S: Final = (9.0, 6.0, 3.0)
 """Ages of the older frames relative to the newest, s (paper appendix A), oldest first."""

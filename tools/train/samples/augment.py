@@ -1,15 +1,24 @@
-"""Image augmentation: light, colour, blur, noise and JPEG, as from other cameras.
+"""Augmentation of images (light, colour, blur, noise, JPEG), and of the language model's samples.
 
-Images are neither mirrored nor shifted, because left, right and position matter for navigation.
+Images are neither mirrored nor shifted, because left, right and position matter for navigation. A small language model
+would memorise the tokens of a thousand places: its frames are shifted by up to 0.3 s, within which an anchor's text is
+valid, and its visual tokens have noise.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.core.geometry import SE2
+from edge.reasoning.path_memory import prompt_point
 from tools.train.config.encoder import AugmentConfig
+from tools.train.config.sft import AROUND, ShowConfig
+from tools.train.samples.anchors import Anchor, frames_at
+from tools.train.samples.language_batch import Halves
 
 Picture = NDArray[np.uint8]
 
@@ -54,3 +63,40 @@ def decoded(data: NDArray[np.uint8]) -> Picture:
 def through_jpeg(picture: Picture, quality: int) -> Picture:
     """Encode and decode an image with JPEG."""
     return decoded(encoded(picture, quality))
+
+
+def shifted(anchor: Anchor, config: ShowConfig, rng: np.random.Generator) -> Anchor:
+    """Shift an anchor by a few frames if the drive has them; the number of draws from `rng` is always the same."""
+    by = int(rng.integers(-config.shift_frames, config.shift_frames + 1))
+    jitter = rng.integers(-config.jitter_frames, config.jitter_frames + 1, 8)
+    points = anchor.around[AROUND + by] if anchor.around else None
+    T_shown_anchor = anchor.moved[AROUND + by] if anchor.moved else None
+    if anchor.waited or points is None or T_shown_anchor is None:
+        return anchor
+    return replace(
+        anchor,
+        k=anchor.k + by,
+        way=tuple(prompt_point(T_shown_anchor @ SE2(x_m, y_m, 0.0)) for x_m, y_m in anchor.way),
+        frames=_jittered(frames_at(anchor.k + by), jitter),
+        points=points,
+        reasoning=replace(anchor.reasoning, waypoints=points),
+    )
+
+
+def _jittered(frames: tuple[int, ...], jitter: NDArray[np.int64]) -> tuple[int, ...]:
+    """Shift the older frames; their order is kept."""
+    found: list[int] = []
+    for frame, by in zip(frames[:-1], jitter, strict=False):
+        found.append(min(max(frame + int(by), found[-1] + 1 if found else 0), frames[-1] - 1))
+    return (*found, frames[-1]) if len(set(found)) == len(found) else frames
+
+
+def disturbed(frames: tuple[Halves, ...], config: ShowConfig, rng: np.random.Generator) -> tuple[Halves, ...]:
+    """Add noise to the visual tokens [N, D] of each frame and set some of them to zero."""
+    shown: list[Halves] = []
+    for tokens in frames:
+        values = tokens.astype(np.float32)
+        noise = rng.standard_normal(values.shape, np.float32) * np.float32(config.noise * float(values.std()))
+        kept = rng.uniform(size=(len(values), 1)) >= config.drop
+        shown.append(np.asarray((values + noise) * kept, np.float16))
+    return tuple(shown)

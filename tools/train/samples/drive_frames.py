@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.core.geometry import SE2
+from tools.train.config.checks import TrainError
 from tools.train.config.collect import RATE_HZ
 from tools.train.config.imitate import WeightConfig
 from tools.train.drives.drive import EXPERT, FUTURE_STEPS, POLICY_DRIVER, Drive
-from tools.train.scenes.trace_sentences import NO_PEOPLE
-from tools.train.scenes.walls import Walls
+from tools.train.drives.trace_sentences import NO_PEOPLE
+from tools.train.drives.walls import Walls
 
 Array = NDArray[np.float64]
 
@@ -24,10 +25,6 @@ _LABEL_STEPS: Final = 30  # steps of a label that its weight depends on
 _STANDS: Final = 0.1  # speed, m/s, and yaw rate, rad/s, below which the robot stands
 _BACKS_OFF_M: Final = 0.05  # distance behind the robot above which a label moves backwards
 _LEADS_M: Final = 0.3  # distance in 3 s above which a label leaves a standing position
-
-
-class DriveFramesError(ValueError):
-    """A network with more plan steps than a label has; one line."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +48,8 @@ class DriveFrames:
     """[N]: relative probability of drawing the frame; 0 if too few steps of the label are known."""
     walls: Walls | None = None
     """Walls along the drive; None if they are not used or not known."""
+    in_mirror: bool = False
+    """Whether tokens and states are those of the mirrored drive."""
 
     def __len__(self) -> int:
         return len(self.state)
@@ -62,9 +61,9 @@ class DriveFrames:
 
     @staticmethod
     def of(drive: Drive, steps: int, weights: WeightConfig, walls: Walls | None = None) -> DriveFrames:
-        """Build the frames of a drive; its images are not needed. Raises DriveFramesError for too many steps."""
+        """Build the frames of a drive; its images are not needed. Raises TrainError for too many steps."""
         if not LEAST_KNOWN <= steps <= FUTURE_STEPS:
-            raise DriveFramesError(f"action.steps: expected {LEAST_KNOWN} to {FUTURE_STEPS}, found {steps}")
+            raise TrainError(f"action.steps: expected {LEAST_KNOWN} to {FUTURE_STEPS}, found {steps}")
         future = drive.future.astype(np.float64)
         # A pose's heading is wrapped; a plan's heading is the sum of its steps and is not.
         start = np.zeros((len(drive), 1))

@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import OrderedDict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from edge.core.cli import write_whole
 from edge.state.frame import fit_frame
 from export.model.vision import VisionEncoder
+from tools.train.config.checks import TrainError
 from tools.train.drives.drive import Dataset, Drive, Entry
 from tools.train.run.distributed import SINGLE, Ranks
 from tools.train.run.job import QuietProgress, StageProgress
@@ -34,17 +35,18 @@ _MAX_OPEN: Final = 256  # open mapped files; a process may have 1024 file descri
 Halves = NDArray[np.float16]
 
 
-class TokenCacheError(ValueError):
-    """Missing or unusable tokens; one line: what, expected, found, what to do."""
+def tensors_sha256(tensors: Mapping[str, torch.Tensor], head: str = "") -> str:
+    """Hash tensors by name, after `head`."""
+    digest = hashlib.sha256(head.encode())
+    for name, tensor in sorted(tensors.items()):
+        digest.update(f"{name}:{tuple(tensor.shape)}:{tensor.dtype}".encode())
+        digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
 
 
 def encoder_sha256(vision: VisionEncoder) -> str:
     """Hash an encoder's configuration and weights; it does not depend on the weights' file."""
-    digest = hashlib.sha256(repr(vision.config).encode())
-    for name, tensor in sorted(vision.state_dict().items()):
-        digest.update(f"{name}:{tuple(tensor.shape)}:{tensor.dtype}".encode())
-        digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
-    return digest.hexdigest()
+    return tensors_sha256(vision.state_dict(), repr(vision.config))
 
 
 class TokenCache:
@@ -61,19 +63,19 @@ class TokenCache:
         self._open: OrderedDict[str, Halves] = OrderedDict()
 
     def frames(self, drive_id: str) -> Halves:
-        """Return f16 [N, tokens, width] of all frames of a drive, mapped from a file. Raises TokenCacheError."""
+        """Return f16 [N, tokens, width] of all frames of a drive, mapped from a file. Raises TrainError."""
         if drive_id not in self._open:
             entry = self._entry(drive_id)
             if not self.has(entry):
-                raise TokenCacheError(f"tokens: drive {drive_id} is not encoded yet in {self.folder}; build it first")
+                raise TrainError(f"tokens: drive {drive_id} is not encoded yet in {self.folder}; build it first")
             path = self._npy(drive_id)
             try:
                 rows: Halves = np.load(path, mmap_mode="r", allow_pickle=False)
             except (OSError, ValueError) as error:
-                raise TokenCacheError(f"{path}: not readable ({error}); delete it and build it again") from error
+                raise TrainError(f"{path}: not readable ({error}); delete it and build it again") from error
             wanted = (entry.frames, *self.shape)
             if rows.dtype != np.float16 or rows.shape != wanted:
-                raise TokenCacheError(f"{path}: expected f16 {wanted}, found {rows.dtype} {rows.shape}; delete it")
+                raise TrainError(f"{path}: expected f16 {wanted}, found {rows.dtype} {rows.shape}; delete it")
             self._open[drive_id] = rows
             if len(self._open) > _MAX_OPEN:
                 self._open.popitem(last=False)
@@ -106,7 +108,7 @@ class TokenCache:
         """Encode missing drives (of `ids`), `batch` frames at a time; return how many this rank encoded.
 
         The encoder is moved to `device` and back. Ranks share the drives; all must call this function. Raises
-        TokenCacheError for values beyond float16, DriveError for a damaged drive, OSError.
+        TrainError for values beyond float16 or a damaged drive, OSError.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         ranks.barrier()
@@ -133,7 +135,7 @@ class TokenCache:
             pictures = np.concatenate([fit_frame(drive.frame(k), px) for k in chosen])
             tokens[start : start + len(chosen)] = encode(self._vision, pictures, device)
         if not np.isfinite(tokens).all():
-            raise TokenCacheError(f"drive {drive.id}: tokens exceed float16; train the encoder again")
+            raise TrainError(f"drive {drive.id}: tokens exceed float16; train the encoder again")
         return tokens
 
     def _write(self, entry: Entry, tokens: Halves) -> None:
@@ -149,7 +151,7 @@ class TokenCache:
 
     def _entry(self, drive_id: str) -> Entry:
         if drive_id not in self._entries:
-            raise TokenCacheError(f"tokens: drive {drive_id} is not in the data set {self._dataset.folder}")
+            raise TrainError(f"tokens: drive {drive_id} is not in the data set {self._dataset.folder}")
         return self._entries[drive_id]
 
     def _npy(self, drive_id: str) -> Path:

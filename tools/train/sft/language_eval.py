@@ -19,8 +19,7 @@ from export.model.language import LanguageModel
 from tools.train.config.collect import RATE_HZ
 from tools.train.config.sft import EvalConfig
 from tools.train.samples.anchors import WAYPOINTS_START, Anchor, Drawn, Prompts
-from tools.train.samples.greedy import decode
-from tools.train.samples.language_batch import FrameTokens, Row, collate, frames_of
+from tools.train.samples.language_batch import FrameTokens, Row, collate, decode, frames_of
 
 _TAG: Final = 0xE7A1
 
@@ -90,18 +89,9 @@ class Score:
         return {key: numbers[key] for key in ("answers", "waypoints_parsable", "waypoint_error_m")}
 
 
-def evaluate(
-    language: LanguageModel,
-    prompts: Prompts,
-    tokens: FrameTokens,
-    anchors: Sequence[Anchor],
-    config: EvalConfig,
-    *,
-    seed: int,
-) -> dict[str, Any]:
+def evaluate(speaker: Speaker, anchors: Sequence[Anchor], config: EvalConfig, *, seed: int) -> dict[str, Any]:
     """Return scores as `taught` (true previous progress), `own` (its own previous progress) and `waypoints_only`."""
     rng = np.random.default_rng((seed, _TAG))
-    speaker = Speaker(language, prompts, tokens, config)
     some = _some(anchors, config.anchors, rng)
     scores: dict[str, Any] = {
         "taught": taught(speaker, some, config.gap_s).numbers(),
@@ -113,18 +103,10 @@ def evaluate(
     return scores
 
 
-def glance(
-    language: LanguageModel,
-    prompts: Prompts,
-    tokens: FrameTokens,
-    anchors: Sequence[Anchor],
-    config: EvalConfig,
-    *,
-    seed: int,
-) -> dict[str, float]:
+def evaluate_epoch(speaker: Speaker, anchors: Sequence[Anchor], config: EvalConfig, *, seed: int) -> dict[str, float]:
     """Return a few scores of `epoch_anchors` fixed anchors for a curve; empty if there are none."""
     some = _some(anchors, config.epoch_anchors, np.random.default_rng((seed, _TAG)))
-    numbers = taught(Speaker(language, prompts, tokens, config), some, config.gap_s).numbers()
+    numbers = taught(speaker, some, config.gap_s).numbers()
     found = {
         "parsable_share": numbers["waypoints_parsable"],
         "progress_share": numbers["progress_right"],
@@ -156,10 +138,7 @@ class Speaker:
     """Greedy decoding of a language model, in batches of similar length."""
 
     def __init__(self, language: LanguageModel, prompts: Prompts, tokens: FrameTokens, config: EvalConfig) -> None:
-        self._language = language
-        self._prompts = prompts
-        self._tokens = tokens
-        self._config = config
+        self._language, self._prompts, self._tokens, self._config = language, prompts, tokens, config
 
     def constraint(self, context: DecodingContext) -> TextConstraint:
         """Return what the runner constrains an answer with."""

@@ -32,17 +32,17 @@ from sim_hil.benchmark.policies.expert_route import RoutePlanner
 from sim_hil.benchmark.suite.robots import footprint_m, max_step_m
 from sim_hil.layouts import LayoutError
 from sim_hil.scene.scene import SceneObject, Vec3
+from tools.train.config.checks import TrainError
 from tools.train.config.collect import TRACE_EVERY
 from tools.train.config.sft import RelabelConfig
 from tools.train.drives.drive import PLAN_TIMES_S, Dataset, Drive, Entry
+from tools.train.drives.progress_labels import RouteProgress
+from tools.train.drives.scenarios import Scenario, ScenarioError, Site, SiteError, is_sound, scenario_of
+from tools.train.drives.trace_sentences import NO_PEOPLE, aspects_json, aspects_of_json, five_aspects
+from tools.train.drives.traces import Sight, Tracer, turning_first
 from tools.train.run.distributed import SINGLE, Ranks
 from tools.train.run.job import QuietProgress, StageProgress
 from tools.train.samples.anchors import Anchor, anchors_of
-from tools.train.scenes.progress_labels import RouteProgress
-from tools.train.scenes.scenarios import Scenario, ScenarioError, is_sound, scenario_of
-from tools.train.scenes.sites import Site, SiteError
-from tools.train.scenes.trace_sentences import NO_PEOPLE, aspects_json, aspects_of_json, five_aspects
-from tools.train.scenes.traces import Sight, Tracer, turning_first
 
 FOLDER: Final = "retold"
 FORMAT: Final = 2
@@ -54,10 +54,6 @@ _FREE: Final = 0.9  # least share of a drive's poses on free floor if the scene 
 _ARRIVE_SHARE: Final = 0.7  # share of the success distance at which a relabel ends, as drives do
 _REACH_M: Final = 10.0  # planned length of a route: 9 s of driving
 _TAG: Final = 0x2E7E11
-
-
-class RelabelError(ValueError):
-    """Relabels that cannot be read; one line: what, expected, found, what to do."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +123,7 @@ class InstructionRelabels:
     ) -> None:  # fmt: skip
         """Compute the missing relabels of these drives. Ranks share the layouts; all must call this function.
 
-        Raises DriveError, OSError, and KeyboardInterrupt when `stopped` on any rank.
+        Raises TrainError, OSError, and KeyboardInterrupt when `stopped` on any rank.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         ranks.barrier()
@@ -154,10 +150,10 @@ class InstructionRelabels:
             raise KeyboardInterrupt
 
     def anchors(self, drive: Drive) -> list[Anchor]:
-        """Return a drive's relabelled anchors without a person near. Raises RelabelError before `build`."""
+        """Return a drive's relabelled anchors without a person near. Raises TrainError before `build`."""
         found = self._read(drive.id)
         if found is None:
-            raise RelabelError(f"{self._path(drive.id)}: not the relabels of this drive; build them first")
+            raise TrainError(f"{self._path(drive.id)}: not the relabels of this drive; build them first")
         alone = {int(trace["k"]) for trace in drive.traces if trace["motion"] == NO_PEOPLE}
         return [anchor for each in found for anchor in anchors_of(each.of(drive)) if anchor.k in alone]
 

@@ -7,10 +7,8 @@ run resumes exactly, and the number of ranks does not change the batches.
 from __future__ import annotations
 
 import hashlib
-import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -19,38 +17,29 @@ import torch
 from tokenizers import Tokenizer
 
 from edge.state.reasoning_text import format_text
-from export.checkpoint import tokenizer_for
+from export.checkpoint.tokenizer import tokenizer_for
 from export.model.network import TicVla
-from tools.train.collect.tours import build_tours, tour_anchors
-from tools.train.config.collect import OF_TOURS, PLANNED_DRIVE_S, RATE_HZ, CollectConfig
-from tools.train.config.optim import OptimConfig
-from tools.train.config.recipe import Recipe
+from tools.train.collect.collection import build_tours, tour_anchors
+from tools.train.config.checks import OptimConfig, TrainError
 from tools.train.config.sft import DrawConfig, SftConfig, ShowConfig
 from tools.train.drives.drive import Dataset
-from tools.train.run import checkpoint
+from tools.train.run.distributed import autocast
 from tools.train.run.job import StageJob
+from tools.train.run.loop import Optimiser, TrainingLoop
 from tools.train.run.network_file import finish_network, read_network, stage_weights, start_network
-from tools.train.run.optim import Optimiser, autocast
-from tools.train.run.own_drives import drives_after
+from tools.train.run.run_dir import drives_after
 from tools.train.samples.anchors import Anchor, Prompts, anchors_of, draw, waiting
-from tools.train.samples.kv_build import parts_sha256
+from tools.train.samples.augment import disturbed, shifted
+from tools.train.samples.kv_cache import parts_sha256
 from tools.train.samples.language_batch import Halves, LanguageBatch, Row, buckets, collate, row_losses
 from tools.train.samples.mirror import FOLDER as MIRRORED
 from tools.train.samples.mirror import Joined, SecondsDataset, Views, mirrored
 from tools.train.samples.tokens import TokenCache
-from tools.train.sft.language_augment import disturbed, shifted
-from tools.train.sft.language_eval import evaluate, glance
+from tools.train.sft.language_eval import Speaker, evaluate, evaluate_epoch
 from tools.train.sft.relabel import InstructionRelabels
 
 STAGE: Final = "sft"
-PLANNED_TOUR_S: Final = 45.0
-_DECIDE: Final = 0.3  # share of deciding anchors, measured in `nano`'s 328 drives
-_RETOLD: Final = 0.2  # share of a drive's anchors that each other instruction adds, measured in 16 drives
 _DRAWS, _ORDER, _HELD, _NOISE, _AGAIN = 0x5F71, 0x5F72, 0x5F73, 0x5F74, 0x5F75
-
-
-class SftError(ValueError):
-    """Unusable data, or a checkpoint of another run; one line."""
 
 
 @dataclass(frozen=True)
@@ -125,33 +114,10 @@ class Samples:
         return disturbed(frames, self._show, np.random.default_rng((_NOISE, sample.noise_seed)))
 
 
-def budget(recipe: Recipe) -> list[tuple[str, int, str]]:
-    """Return (description, number, key of the throughput) of this stage's work, planned with drives of 30 s."""
-    config, collect = recipe.sft or SftConfig(), recipe.collect
-    seconds = round(PLANNED_DRIVE_S * collect.episodes) if collect is not None else 0
-    each = (1 + _DECIDE * (config.deciding - 1)) * (1 + _RETOLD * config.retold.ways)
-    anchors = round(seconds * each) * config.epochs
-    drives = [("frames encoded", seconds * RATE_HZ, "encode"), ("anchors learned", anchors, "sft")]
-    if not config.tours.count:
-        return drives
-    toured = round(PLANNED_TOUR_S * config.tours.count)
-    shown = round(toured * (1 + _DECIDE * (config.deciding - 1))) * config.epochs
-    frames = toured * (2 if config.mirrored > 0 else 1)
-    tours = (
-        ("made", config.tours.count, "tour"),
-        ("frames encoded", frames, "encode"),
-        ("anchors learned", shown, "sft"),
-    )
-    return [*drives, *((f"{OF_TOURS}{what}", count, key) for what, count, key in tours)]
-
-
 def run(job: StageJob) -> dict[str, Any]:
-    """Train on the run's data set and write the network with its new language model.
-
-    Raises SftError, CollectError, DriveError, TokenCacheError, NetworkFileError, CheckpointFileError.
-    """
-    config = _config(job)
-    dataset = drives_after(job, STAGE)
+    """Train on the run's data set and write the network with its new language model. Raises TrainError."""
+    config = job.recipe.sft
+    dataset = drives_after(job.run_dir, job.recipe, STAGE)
     network, epochs, optim = _start(job, config)
     plain = TokenCache(dataset, network.vision)
     mirror: TokenCache | None = None
@@ -197,42 +163,37 @@ def fit(
 
     `more`: additional anchors, from relabelled drives and tours.
     """
-    config, language = _config(job), network.language
-    content = tokenizer_for(network.config, None)
-    prompts = Prompts(Tokenizer.from_buffer(content), network.config)
+    config, language = job.recipe.sft, network.language
+    tokenizer = tokenizer_for(network.config, None)
+    prompts = Prompts(Tokenizer.from_buffer(tokenizer), network.config)
     anchors = [*_anchors(dataset, dataset.train), *_waiting(dataset, dataset.train), *more]
     data = Samples(anchors, prompts, views, config.words, config.mirrored, config.deciding, config.shown)
     held = Samples(list(_anchors(dataset, dataset.val)), prompts, views, config.words)
     if not data.anchors:
-        raise SftError(f"{dataset.folder}: no anchors with reasoning text; collect drives, or import them with texts")
+        raise TrainError(f"{dataset.folder}: no anchors with reasoning text; collect drives, or import them with texts")
     per_epoch = -(-len(data) // config.batch)
     total = per_epoch * config.epochs
     job.ranks.copy_parameters(language.parameters())
     optimiser = Optimiser(language.parameters(), config.optim, total, job.ranks)
-    state = _State(job, network, optimiser, _key(job, config, dataset, content, network, more))
-    numbers = state.load()
+    content = _content(job, dataset, tokenizer, network, more)
+    loop = TrainingLoop(job, STAGE, {"language": language}, optimiser, content, config.checkpoint_steps)
     questions = _held(held, config, job.seed)
-    while optimiser.step_count < total:
-        epoch, within = divmod(optimiser.step_count, per_epoch)
-        samples = data.draw(np.random.default_rng((job.seed, _DRAWS, epoch)))
-        order = buckets([len(each) for each in samples], config.batch, np.random.default_rng((job.seed, _ORDER, epoch)))
-        for chosen in order[within:]:
-            lr = optimiser.lr
-            numbers["loss"] = _learn(job, network, optimiser, data, [samples[i] for i in chosen])
-            step = optimiser.step_count
-            line = {"loss": numbers["loss"], "lr": lr}
-            if questions and step % per_epoch == 0:
-                line["held_loss"] = numbers["held_loss"] = mean_loss(job, network, held, questions)
-            if job.ranks.first:
-                if step % per_epoch == 0:
-                    line |= glance(language, prompts, views.plain, held.anchors, config.evaluate, seed=job.seed)
-                job.run_dir.log(STAGE, step, **line)
-            job.progress.update(step, total, **numbers)
-            stopping = job.should_stop()
-            if stopping or step % config.checkpoint_steps == 0 or step % per_epoch == 0:
-                state.save(numbers)
-            if stopping:
-                raise KeyboardInterrupt
+    speaker = Speaker(language, prompts, views.plain, config.evaluate)
+
+    def losses(samples: Sequence[Sample]) -> torch.Tensor:
+        batch = _batch(job, network, data, samples)
+        with autocast(job.device, config.optim.bf16):
+            return row_losses(language, batch)
+
+    def scores(step: int) -> dict[str, float]:
+        if step % per_epoch:
+            return {}
+        found = {"held_loss": mean_loss(job, network, held, questions)} if questions else {}
+        if job.ranks.first:
+            found |= evaluate_epoch(speaker, held.anchors, config.evaluate, seed=job.seed)
+        return found
+
+    numbers = loop.run(_shares(job, data, optimiser.step_count, per_epoch), losses, scores)
     result: dict[str, Any] = {
         "steps": total,
         "anchors": len(data.anchors),
@@ -241,13 +202,13 @@ def fit(
         **numbers,
     }
     if job.ranks.first and held.anchors:
-        result["held_out"] = evaluate(language, prompts, views.plain, held.anchors, config.evaluate, seed=job.seed)
+        result["held_out"] = evaluate(speaker, held.anchors, config.evaluate, seed=job.seed)
     return result
 
 
 def mean_loss(job: StageJob, network: TicVla, data: Samples, questions: Sequence[Sample]) -> float:
     """Compute the mean of equation 3 over one or more samples, in batches shared by the ranks."""
-    config = _config(job)
+    config = job.recipe.sft
     order = sorted(range(len(questions)), key=lambda i: (len(questions[i]), i))
     batches = [order[at : at + config.batch] for at in range(0, len(order), config.batch)]
     total = 0.0
@@ -258,18 +219,14 @@ def mean_loss(job: StageJob, network: TicVla, data: Samples, questions: Sequence
     return job.ranks.sum(total) / len(questions)
 
 
-def _learn(job: StageJob, network: TicVla, optimiser: Optimiser, data: Samples, samples: Sequence[Sample]) -> float:
-    """Run one step with one global batch and return its mean loss over all ranks."""
-    own = samples[job.ranks.rank :: job.ranks.world]
-    value = 0.0
-    if own:
-        batch = _batch(job, network, data, own)
-        with autocast(job.device, optimiser.config.bf16):
-            loss = row_losses(network.language, batch).mean()
-        loss.backward()
-        value = float(loss.detach())
-    optimiser.step(len(own))
-    return job.ranks.mean(value, len(own))
+def _shares(job: StageJob, data: Samples, first: int, per_epoch: int) -> Iterator[Sequence[Sample]]:
+    """Yield this rank's share of the batches from step `first` on."""
+    config, ranks = job.recipe.sft, job.ranks
+    for epoch in range(first // per_epoch, config.epochs):
+        samples = data.draw(np.random.default_rng((job.seed, _DRAWS, epoch)))
+        order = buckets([len(each) for each in samples], config.batch, np.random.default_rng((job.seed, _ORDER, epoch)))
+        for chosen in order[max(0, first - epoch * per_epoch) :]:
+            yield [samples[i] for i in chosen[ranks.rank :: ranks.world]]
 
 
 def _batch(job: StageJob, network: TicVla, data: Samples, samples: Sequence[Sample]) -> LanguageBatch:
@@ -292,11 +249,10 @@ def _anchors(dataset: Dataset, ids: Sequence[str]) -> Iterator[Anchor]:
 
 def _tours(job: StageJob, dataset: Dataset) -> Dataset:
     """Return the tours to train on; missing ones are recorded."""
-    collected = job.recipe.collect or CollectConfig()
-    config, rounds = _config(job), job.run_dir.retired(STAGE)
+    config, rounds = job.recipe.sft, job.run_dir.retired(STAGE)
     job.progress.say("recording tours")
     tours = build_tours(
-        dataset, config.tours, collected, job.recipe.seed, ranks=job.ranks, progress=job.progress,
+        dataset, config.tours, job.recipe.collect, job.recipe.seed, ranks=job.ranks, progress=job.progress,
         stopped=lambda: job.stop.asked,
     )  # fmt: skip
     if not rounds or not config.go_on_share:
@@ -320,8 +276,8 @@ def _with_tours(job: StageJob, network: TicVla, views: Views, tours: Dataset) ->
 
 def _retold(job: StageJob, dataset: Dataset) -> list[Anchor]:
     """Return the anchors of relabelled training drives; missing relabels are computed."""
-    collected = job.recipe.collect or CollectConfig()
-    relabels = InstructionRelabels(dataset, _config(job).retold, job.recipe.seed, collected.speed_mps)
+    recipe = job.recipe
+    relabels = InstructionRelabels(dataset, recipe.sft.retold, recipe.seed, recipe.collect.speed_mps)
     job.progress.say("relabelling drives")
     relabels.build(dataset.train, ranks=job.ranks, progress=job.progress, stopped=lambda: job.stop.asked)
     return [anchor for drive in dataset.drives(dataset.train, pictures=False) for anchor in relabels.anchors(drive)]
@@ -334,61 +290,16 @@ def _waiting(dataset: Dataset, ids: Sequence[str]) -> Iterator[Anchor]:
             yield waiting(anchor, 1 + number % 3)
 
 
-def _config(job: StageJob) -> SftConfig:
-    if job.recipe.sft is None:
-        raise SftError("the recipe has no table [sft]")
-    return job.recipe.sft
-
-
-def _key(
-    job: StageJob, config: SftConfig, dataset: Dataset, tokenizer: bytes, network: TicVla, more: Sequence[Anchor]
-) -> str:  # fmt: skip
-    """Hash what a checkpoint depends on; only an equal hash can be resumed."""
-    made = {
+def _content(
+    job: StageJob, dataset: Dataset, tokenizer: bytes, network: TicVla, more: Sequence[Anchor]
+) -> dict[str, object]:
+    """Return what a checkpoint depends on."""
+    return {
         "seed": job.seed,
-        "config": asdict(config),
+        "config": asdict(job.recipe.sft),
         "dataset": dataset.sha256,
         "tokenizer": hashlib.sha256(tokenizer).hexdigest(),
         "sizes": asdict(network.config.language),
         "vision": parts_sha256(network, ("vision",)),
         "more": hashlib.sha256("\n".join(format_text(each.reasoning) for each in more).encode()).hexdigest(),
     }
-    return hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()
-
-
-class _State:
-    """The stage's checkpoint: weights, optimiser, step and the last losses."""
-
-    def __init__(self, job: StageJob, network: TicVla, optimiser: Optimiser, key: str) -> None:
-        self._job = job
-        self._network = network
-        self._optimiser = optimiser
-        self._key = key
-        self._path: Path = job.run_dir.stage(STAGE) / "checkpoint.safetensors"
-
-    def save(self, numbers: Mapping[str, float]) -> None:
-        """Write the checkpoint, in the first rank alone: all ranks have equal weights."""
-        if self._job.ranks.first:
-            weights = checkpoint.with_prefix("language", self._network.language.state_dict())
-            meta = {"key": self._key, "step": self._optimiser.step_count, "numbers": dict(numbers)}
-            checkpoint.save(self._path, {**weights, **self._optimiser.tensors()}, meta)
-
-    def load(self) -> dict[str, float]:
-        """Resume if requested and possible; return the last losses. Raises SftError for another run's checkpoint."""
-        if not (self._job.resume and self._path.exists()):
-            self._rewind(-1)
-            return {}
-        tensors, meta = checkpoint.load(self._path)
-        if meta["key"] != self._key:
-            raise SftError(
-                f"{self._path}: checkpoint of other data, another encoder or another recipe; delete it to start again"
-            )
-        self._network.language.load_state_dict(checkpoint.under("language", tensors))
-        self._optimiser.restore(tensors)
-        self._rewind(int(meta["step"]))
-        return dict(meta["numbers"])
-
-    def _rewind(self, step: int) -> None:
-        if self._job.ranks.first:
-            self._job.run_dir.rewind(STAGE, step)
-        self._job.ranks.barrier()

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from edge.core.geometry import SE2
 from firmware_bridge.unitree.messages import ids
 from sim_hil.crowd.people import PERSON_RADIUS_M
-from sim_hil.protocols.unitree.services.parameters import parse_flag, parse_numbers, parse_table
-from sim_hil.protocols.unitree.services.service import Answer
+from sim_hil.protocols.unitree.services.service import Answer, parse_flag, parse_numbers, parse_table
 from sim_hil.scene.scene import Box
 
 Vec3 = tuple[float, float, float]

@@ -11,7 +11,7 @@ from math import cos, sin
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
-from sim_hil.robots.go2.gait import GaitConfig, neutral_feet
+from sim_hil.robots.go2.gait import GaitConfig
 from sim_hil.robots.go2.kinematics import Vec3, joint_angles
 
 Joints = tuple[float, ...]
@@ -54,7 +54,7 @@ def body_over_feet(
     `lifted`: offset of a foot (0..3 = FR, FL, RR, RL) from its place on the ground, level frame, m.
     """
     angles: list[float] = []
-    for leg, (x, y, z) in enumerate(neutral_feet(GaitConfig())):
+    for leg, (x, y, z) in enumerate(GaitConfig().home):
         dx, dy, dz = lifted.get(leg, (0.0, 0.0, 0.0))
         level = (x + dx - shift_m[0], y + dy - shift_m[1], z + dz - shift_m[2])
         angles += joint_angles(leg, _rotated_back(level, roll, pitch, yaw))

@@ -1,7 +1,9 @@
-"""Robot's side of a Unitree request/response service over two DDS topics."""
+"""Robot's side of a Unitree request/response service over two DDS topics: server, lease, parsers of parameters."""
 
 from __future__ import annotations
 
+import json
+import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -12,7 +14,100 @@ from cyclonedds.sub import DataReader
 from firmware_bridge.unitree.dds import DDS_ERRORS, Bus, take_each
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.messages.idl import Request_, RequestIdentity_, Response_, ResponseHeader_, ResponseStatus_
-from sim_hil.protocols.unitree.services.leases import ERROR_DENIED, Lease
+
+APPLY: Final = 101
+RENEW: Final = 102
+TERM_US: Final = 1_000_000  # as in the maker's server; its client renews after 0.3 of the term
+ERROR_DENIED: Final = 3205
+ERROR_NOT_EXIST: Final = 3206
+ERROR_EXISTS: Final = 3207
+
+
+class Lease:
+    """Lease of a service: while a client has it, requests of other clients are denied.
+
+    Ids are times in microseconds, as in the maker's server.
+    """
+
+    def __init__(self, term_us: int = TERM_US) -> None:
+        self._term_us = term_us
+        self._id = 0  # 0: no holder
+        self._renewed_ns = 0
+
+    def holder(self, now_ns: int) -> int:
+        """Return the id of the current lease, 0 if there is none."""
+        if self._id and now_ns > self._renewed_ns + self._term_us * 1000:
+            self._id = 0
+        return self._id
+
+    def denies(self, lease_id: int, now_ns: int) -> bool:
+        """Return whether a request with this lease id (0: none) must be denied."""
+        return self.holder(now_ns) != lease_id
+
+    def handle(self, api_id: int, parameter: str, lease_id: int, now_ns: int) -> tuple[int, str]:
+        """Handle a request of the service NAME_lease; return code and data."""
+        if api_id == APPLY:
+            return self._apply(parameter, now_ns)
+        if api_id == RENEW:
+            return self._renew(lease_id, now_ns), ""
+        return ids.ERROR_NOT_IMPLEMENTED, ""
+
+    def _apply(self, parameter: str, now_ns: int) -> tuple[int, str]:
+        try:
+            table = json.loads(parameter)
+        except (ValueError, RecursionError):
+            table = None
+        if not isinstance(table, dict):
+            return ids.ERROR_PARAMETER, ""
+        if self.holder(now_ns):
+            return ERROR_EXISTS, ""
+        self._id, self._renewed_ns = now_ns // 1000, now_ns
+        return ids.OK, json.dumps({"id": self._id, "term": self._term_us})
+
+    def _renew(self, lease_id: int, now_ns: int) -> int:
+        if lease_id == 0 or self.holder(now_ns) != lease_id:
+            return ERROR_NOT_EXIST
+        self._renewed_ns = now_ns
+        return ids.OK
+
+
+_HUGE = 1e9
+
+
+def parse_table(parameter: str) -> dict[str, Any] | None:
+    """Parse a JSON object; None for anything else."""
+    try:
+        table = json.loads(parameter)
+    except (ValueError, RecursionError):
+        return None
+    return table if isinstance(table, dict) else None
+
+
+def parse_numbers(parameter: str, *keys: str) -> tuple[float, ...] | None:
+    """Return the finite numbers under `keys`; None if one is missing or invalid."""
+    table = parse_table(parameter)
+    numbers = []
+    for key in keys:
+        value = None if table is None else table.get(key)
+        if not isinstance(value, (int, float)) or isinstance(value, bool) or not abs(value) < _HUGE:
+            return None
+        numbers.append(float(value))
+    return tuple(numbers) if all(map(math.isfinite, numbers)) else None
+
+
+def parse_flag(parameter: str, key: str) -> bool | None:
+    """Return the boolean under `key`, also given as 0 or 1; None for anything else."""
+    value = (parse_table(parameter) or {}).get(key)
+    if isinstance(value, bool):
+        return value
+    return bool(value) if isinstance(value, int) and value in (0, 1) else None
+
+
+def parse_text(parameter: str, key: str) -> str | None:
+    """Return the text under `key`; None for anything else."""
+    value = (parse_table(parameter) or {}).get(key)
+    return value if isinstance(value, str) else None
+
 
 _QUEUE_DEPTH: Final = 64  # requests queued between two polls
 _MAX_PARAMETER_CHARS: Final = 4096

@@ -1,4 +1,4 @@
-"""Services motion_switcher (sport controller or low level) and robot_state, which switch other services. Pure.
+"""Services motion_switcher (sport controller or low level), robot_state (switches services) and vui (settings). Pure.
 
 Error codes: the maker's motion_switcher_error.hpp (7001 parameter, 7002 busy, 7004 name) and robot_state_error.hpp. The
 client turns status 5 of a ServiceSwitch into 5202, service is protected.
@@ -12,10 +12,9 @@ from collections.abc import Callable
 from typing import Final
 
 from firmware_bridge.unitree.messages import ids
+from sim_hil.protocols.unitree.services.avoidance import Pilot
 from sim_hil.protocols.unitree.services.behaviour import Go2Behaviour
-from sim_hil.protocols.unitree.services.parameters import parse_flag, parse_numbers, parse_text
-from sim_hil.protocols.unitree.services.service import Answer
-from sim_hil.protocols.unitree.services.sport_service import Mover
+from sim_hil.protocols.unitree.services.service import Answer, parse_flag, parse_numbers, parse_text
 
 ERROR_SWITCH_PARAMETER: Final = 7001
 ERROR_SWITCH_BUSY: Final = 7002
@@ -33,7 +32,7 @@ _SERVICE_SWITCH, _REPORT_FREQ, _SERVICE_LIST = 1001, 1002, 1003
 class MotionSwitcher:
     """Service that assigns the joints to one of MODES, or to none, which enables low commands."""
 
-    def __init__(self, behaviour: Go2Behaviour, mover: Mover) -> None:
+    def __init__(self, behaviour: Go2Behaviour, mover: Pilot) -> None:
         """Create the service; `mover` is stopped on release."""
         self._behaviour = behaviour
         self._mover = mover
@@ -129,3 +128,29 @@ class RobotState:
         elif not self._switcher.engaged and self._switcher.select(MODES[0]) != ids.OK:
             return ids.OK, json.dumps({"name": name, "status": 0})
         return ids.OK, json.dumps({"name": name, "status": int(self._switcher.engaged)})
+
+
+VUI_SERVICE: Final = "vui"
+# Set request -> key and highest value; the request with the next id reads the value back.
+_SETTINGS: Final = {1001: ("enable", 1), 1003: ("volume", 10), 1005: ("brightness", 10)}
+
+
+class Vui:
+    """Service that stores settings."""
+
+    def __init__(self) -> None:
+        self._values = dict(_SETTINGS.values())
+
+    def handle(self, api_id: int, parameter: str) -> Answer:
+        """Handle one request."""
+        if api_id in _SETTINGS:
+            key, top = _SETTINGS[api_id]
+            value = parse_numbers(parameter, key)
+            if value is None or value[0] not in range(top + 1):
+                return ids.ERROR_PARAMETER, ""
+            self._values[key] = int(value[0])
+            return ids.OK, ""
+        if api_id - 1 in _SETTINGS:
+            key, _ = _SETTINGS[api_id - 1]
+            return ids.OK, json.dumps({key: self._values[key]})
+        return ids.ERROR_NOT_IMPLEMENTED, ""

@@ -32,12 +32,6 @@ def test_conditions_survive_json(arguments: tuple[str, ...]) -> None:
     assert Conditions.of_json(conditions.as_json()) == conditions
 
 
-@pytest.mark.parametrize(("mode", "latency_s"), [("async", 2.0), ("sync", 2.0), ("no-reasoning", 0.25)])
-def test_the_papers_latency_is_the_default_of_each_mode(mode: str, latency_s: float) -> None:
-    latency = asked("--policy", "artifacts:nano", "--mode", mode).latency
-    assert latency is not None and latency.generation_s == (latency_s,)
-
-
 def test_the_robot_halts_at_its_own_stop_only_on_request() -> None:
     free, stays = asked("--policy", "artifacts:nano"), asked("--policy", "artifacts:nano", "--stay")
     assert not free.stays and "halts" not in free.describe()
@@ -51,9 +45,10 @@ def test_a_switch_that_is_not_asked_for_is_the_manifests() -> None:
     assert "decoding free, recovery off" in resolved.describe()
 
 
-def test_conditions_of_a_run_before_the_switches_can_still_be_read() -> None:
+def test_conditions_of_an_older_version_can_still_be_read() -> None:
     content = asked("--policy", "artifacts:nano").as_json()
-    old = {key: value for key, value in content.items() if key not in ("decoding", "recovery")}
+    added = ("decoding", "recovery", "wordings", "swap_instructions")
+    old = {key: value for key, value in content.items() if key not in added}
     assert Conditions.of_json(old) == asked("--policy", "artifacts:nano")
 
 

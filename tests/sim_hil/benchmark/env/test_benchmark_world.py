@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from math import hypot, pi
 
 import numpy as np
@@ -42,11 +41,9 @@ def test_the_robot_begins_at_the_episodes_start_ready_to_move() -> None:
 
 
 def test_one_step_is_three_frames_of_a_thirtieth_of_a_second() -> None:
-    frames = []
-    with EpisodeWorld(corridor_episode(), on_frame=lambda world: frames.append(world.time_s)) as world:
+    with EpisodeWorld(corridor_episode()) as world:
         world.step(FORWARD)
         assert world.time_s == pytest.approx(0.1)
-        assert frames == pytest.approx([1 / 30, 2 / 30, 3 / 30])
         assert len(world.trajectory()) == 4
 
 
@@ -152,10 +149,6 @@ def test_a_picture_has_the_size_asked_for_and_is_taken_once_an_observation() -> 
         assert world.observe().image is image
 
 
-def test_without_a_camera_there_is_no_picture(reached: EpisodeWorld) -> None:
-    assert reached.observe().image is None
-
-
 def hash_of(**changes: object) -> str:
     with EpisodeWorld(corridor_episode(people=3, timeout_s=2.5, **changes), WorldOptions(drift="severe")) as world:
         while not world.done:
@@ -170,12 +163,6 @@ def test_the_same_episode_gives_the_same_bytes_again_and_in_another_process() ->
     there = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True, timeout=120)
     assert hash_of() == here
     assert there.stdout.split()[-1] == here
-
-
-def test_another_crowd_makes_other_people() -> None:
-    episode = corridor_episode(people=3)
-    with EpisodeWorld(episode) as one, EpisodeWorld(replace(episode, seed=9)) as other:
-        assert not np.allclose(one.people(), other.people())
 
 
 def test_people_walk_at_thirty_hertz_with_the_velocities_told() -> None:

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from sim_hil.benchmark.env.gym_env import ENV_ID, DynaNavEnv
-from sim_hil.benchmark.env.outcome import Outcome
-from sim_hil.benchmark.env.reward import APART_STEPS, Contacts
+from sim_hil.benchmark.env.gym_env import APART_STEPS, ENV_ID, Contacts, DynaNavEnv
+from sim_hil.benchmark.env.metrics import Outcome
 from tests.support.benchmark.benchmark_episodes import block, corridor_episode, hall
 
 FORWARD = np.array((0.8, 0.0, 0.0), np.float32)

@@ -55,13 +55,6 @@ def test_a_random_walk_is_its_seeds() -> None:
     assert not np.array_equal(velocities(RandomPolicy(), 1), velocities(RandomPolicy(), 2))
 
 
-@pytest.mark.parametrize(("y", "sign"), [(3.0, 1.0), (-3.0, -1.0)])
-def test_point_goal_turns_towards_the_goal(y: float, sign: float) -> None:
-    policy = PointGoalPolicy()
-    policy.reset(corridor_episode(goal_xy=(2.0, y)), "Go.", None, 0)
-    assert np.sign(policy.act(seen())[2]) == sign
-
-
 def test_point_goal_knows_the_goal_by_odometry_from_a_turned_start() -> None:
     policy = PointGoalPolicy()
     policy.reset(corridor_episode(start=(1.0, 0.0, pi / 2), goal_xy=(1.0, 5.0)), "Go.", None, 0)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from sim_hil.benchmark.results.record import EpisodeResult, FailedRun, ResultError
+from sim_hil.benchmark.results.record import FailedRun, ResultError
 from sim_hil.benchmark.results.store import FAILED, RESULTS, ResultStore, StoreError, read_failed, read_results
 from tests.support.benchmark import dynanav_fakes as fakes
 
@@ -88,20 +89,25 @@ def test_failed_runs_are_read_back_without_a_torn_last_line(tmp_path: Path) -> N
     assert read_failed(store.directory) == [FailedRun("a", 2, "died")] == store.failed
 
 
-def test_a_damaged_failed_run_is_one_clear_line_with_its_number(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "read", "line", "problem"),
+    [
+        (
+            FAILED,
+            read_failed,
+            '{"id": "a", "attempts": "two", "why": "died"}',
+            "failed run: expected an object with id",
+        ),
+        (RESULTS, read_results, '{"id": 3}', "result: expected an object with the keys"),
+    ],
+)
+def test_a_damaged_line_is_refused_with_its_number(
+    tmp_path: Path, name: str, read: Callable[[Path], object], line: str, problem: str
+) -> None:
     store = made(tmp_path)
-    (store.directory / FAILED).write_text('{"id": "a", "attempts": "two", "why": "died"}\n')
-    with pytest.raises(StoreError, match=r"failed.jsonl:1: failed run: expected an object with id"):
-        read_failed(store.directory)
-
-
-def test_a_damaged_line_is_one_clear_line_with_its_number(tmp_path: Path) -> None:
-    store = made(tmp_path)
-    store.add(fakes.result("a"))
-    with (store.directory / RESULTS).open("a") as file:
-        file.write('{"id": 3}\n')
-    with pytest.raises(StoreError, match=r"results.jsonl:2: result: expected an object with the keys"):
-        read_results(store.directory)
+    (store.directory / name).write_text(f"{line}\n")
+    with pytest.raises(StoreError, match=f"{name}:1: {problem}"):
+        read(store.directory)
 
 
 @pytest.mark.parametrize(
@@ -112,8 +118,3 @@ def test_a_damaged_line_is_one_clear_line_with_its_number(tmp_path: Path) -> Non
 def test_a_result_that_contradicts_itself_is_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(ResultError):
         fakes.result("a", **wrong)
-
-
-def test_a_result_survives_json(tmp_path: Path) -> None:
-    one = fakes.result("a", collided=True, collisions=("bench", "person"))
-    assert EpisodeResult.of_json(one.as_json()) == one

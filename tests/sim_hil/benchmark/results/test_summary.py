@@ -12,7 +12,7 @@ from sim_hil.benchmark import cli
 from sim_hil.benchmark.results.bootstrap import mean_ci95, paired_ci95
 from sim_hil.benchmark.results.record import FailedRun, ResultError
 from sim_hil.benchmark.results.store import ResultStore
-from sim_hil.benchmark.results.summary import compare, crowd_level, summarise
+from sim_hil.benchmark.results.summary import compare, summarise
 from tests.support.benchmark import dynanav_fakes as fakes
 
 
@@ -85,12 +85,6 @@ def test_summaries_resample_the_tasks_of_their_results() -> None:
     assert high - low > 2 * (to - from_)
 
 
-@pytest.mark.parametrize(("value", "expected"), [(100.0, (95.68, 100.0)), (0.0, (0.0, 4.32))])
-def test_a_rate_that_all_episodes_share_is_not_certain(value: float, expected: tuple[float, float]) -> None:
-    # Wilson's interval of 85 in 85, and of 0 in 85.
-    assert mean_ci95([value] * 85, each_its_own(85), (0.0, 100.0)) == pytest.approx(expected, abs=0.01)
-
-
 def test_rates_of_a_summary_are_never_certain_and_stay_within_what_a_rate_can_be() -> None:
     summary = summarise([fakes.result(f"e{i}", spl=100.0) for i in range(20)])
     assert summary["sr_ci95"] == summary["spl_ci95"] == pytest.approx([83.89, 100.0], abs=0.01)
@@ -131,13 +125,6 @@ def test_a_difference_whose_interval_holds_zero_is_not_called_significant() -> N
     one = compare([fakes.missed("a"), *mixed()], [fakes.result("a"), *mixed()])["differences"]["sr"]
     assert some["significant"] and some["ci95"][0] > 0
     assert not one["significant"] and one["ci95"][0] == 0
-
-
-@pytest.mark.parametrize(
-    ("people", "level"), [(0, "0"), (1, "1-20"), (20, "1-20"), (60, "41-60"), (200, "61 and more")]
-)
-def test_crowd_levels(people: int, level: str) -> None:
-    assert crowd_level(people) == level
 
 
 def run_of(folder: Path, results: list[fakes.EpisodeResult], suite: str = "dynanav") -> Path:

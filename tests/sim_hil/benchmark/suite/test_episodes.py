@@ -8,10 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from sim_hil.benchmark.language.instructions import is_held_out
-from sim_hil.benchmark.suite.build import PARTS, VERSION, build_part, timeout_s
+from sim_hil.benchmark.suite.build import PARTS, VERSION, build_part
 from sim_hil.benchmark.suite.episode import SUITES, Episode, SuiteError, load_suite, parse_suite, suite_to_toml
-from sim_hil.scene.scene import load_scene
 
 TEXT = (SUITES / "dynanav.toml").read_text(encoding="utf-8")
 EPISODES = load_suite("dynanav")
@@ -67,22 +65,8 @@ def test_the_threshold_is_the_papers_indoors_and_relaxed_outdoors() -> None:
     assert all(e.threshold_m > 1.5 for e in EPISODES if e.scene == "sidewalk")
 
 
-def test_every_task_has_wordings_that_no_training_text_may_have() -> None:
-    for episode in EPISODES:
-        assert len(episode.instructions) >= 4
-        assert all(is_held_out(text) for text in episode.instructions)
-
-
 def test_no_two_episodes_have_one_seed() -> None:
     assert len({episode.seed for episode in EPISODES}) == len(EPISODES)
-
-
-def test_landmarks_are_things_of_the_scene() -> None:
-    for scene in {episode.scene for episode in EPISODES}:
-        labels = {thing.label for thing in load_scene(scene).landmarks()}
-        for episode in EPISODES:
-            if episode.scene == scene:
-                assert set(episode.landmarks) <= labels
 
 
 def test_the_file_is_what_the_builder_builds() -> None:
@@ -95,11 +79,6 @@ def test_the_file_is_what_the_builder_builds() -> None:
 def test_a_suite_reads_back_what_was_written() -> None:
     assert suite_to_toml("dynanav", VERSION, EPISODES) == TEXT
     assert parse_suite(TEXT, "again") == EPISODES
-
-
-def test_a_timeout_grows_with_distance_and_crowd() -> None:
-    assert timeout_s(10, 0, False) < timeout_s(20, 0, False) < timeout_s(20, 60, False)
-    assert timeout_s(50, 100, True) < timeout_s(50, 200, True)
 
 
 def test_a_go2_that_halts_to_think_can_be_in_time_indoors() -> None:

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from sim_hil.benchmark.results.store import ResultStore, read_results
-from sim_hil.benchmark.workers.jobs import Ended, RefusedRunError, RunWatcher, run_all
-from sim_hil.benchmark.workers.local_jobs import LocalJobs
+from sim_hil.benchmark.workers.jobs import Ended, LocalJobs, RefusedRunError, RunWatcher, run_all
 from sim_hil.benchmark.workers.task import EpisodeTask
 from tests.support.benchmark import dynanav_fakes as fakes
 

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim_hil.protocols.can.e2e import Frame
-from sim_hil.protocols.can.frames import Decoder, Encoder
+from sim_hil.protocols.can.frames import Decoder, Encoder, Frame
 from sim_hil.protocols.can.node import ERROR_BUS_OFF, ERROR_RESTARTED
 from sim_hil.protocols.can.shim import BABBLER_ID, FRAME_S, FaultPlan, FaultShim
+from sim_hil.protocols.fault_socket import parse_plan
 
 COUNT = 2000
 TICK_S = 0.002
@@ -26,12 +26,6 @@ def passed(plan: FaultPlan, seed: int = 0, direction: int = 0, tick_s: float = T
 
 def numbers(frames: list[Frame]) -> list[int]:
     return [int.from_bytes(frame.data, "little") for frame in frames]
-
-
-def test_without_faults_every_frame_arrives_at_once() -> None:
-    shim = FaultShim(FaultPlan(), 0, 0)
-    shim.put(Frame(0x100, b"a"), 1.0)
-    assert shim.take(1.0) == [Frame(0x100, b"a")]
 
 
 @settings(max_examples=8, deadline=None)
@@ -57,7 +51,7 @@ def test_another_fault_does_not_move_the_dice_of_the_first() -> None:
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5])
-def test_frames_are_dropped_as_often_as_asked(share: float) -> None:
+def test_frames_are_dropped_at_the_given_share(share: float) -> None:
     assert len(passed(FaultPlan(drop=share))) == pytest.approx(COUNT * (1 - share), rel=0.1)
 
 
@@ -77,10 +71,9 @@ def test_a_corrupted_frame_is_never_taken_for_a_good_one() -> None:
         for frame in shim.take(number * TICK_S):
             received = decoder.decode(frame)
             assert received is not None and not received.good
-    assert shim.done["corrupt"] == COUNT
 
 
-def test_while_the_bus_is_off_nothing_passes_and_both_ends_of_it_are_told() -> None:
+def test_no_frame_passes_a_bus_that_is_off_and_error_frames_mark_both_ends() -> None:
     plan = FaultPlan(bus_off_every_s=1.0, bus_off_s=0.25)
     arrived = passed(plan)
     errors = [frame.identifier for frame in arrived if frame.error]
@@ -97,18 +90,11 @@ def test_a_babbling_idiot_fills_the_bus_and_starves_the_others() -> None:
     assert len(babble) == pytest.approx((COUNT * TICK_S + 10.5 - 2.0) / FRAME_S, rel=0.01)
 
 
-def test_a_babbler_that_is_switched_on_late_says_nothing_of_the_time_before() -> None:
+def test_a_babbler_sends_no_frames_for_the_time_before_it_was_switched_on() -> None:
     shim = FaultShim(FaultPlan(), 0, 0)
     shim.take(600.0)
     shim.plan = FaultPlan(babble_hz=1000.0)
     assert len(shim.take(600.01)) == 10
-
-
-def test_a_babbler_that_is_slowed_down_goes_on_at_its_new_rate() -> None:
-    shim = FaultShim(FaultPlan(babble_hz=1000.0), 0, 0)
-    shim.take(1.0)
-    shim.plan = FaultPlan(babble_hz=100.0)
-    assert len(shim.take(2.0)) == 100
 
 
 def test_a_babbler_that_leaves_gaps_delays_the_others() -> None:
@@ -124,8 +110,10 @@ def test_a_babbler_that_leaves_gaps_delays_the_others() -> None:
 )
 def test_a_plan_that_makes_no_sense_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="expected"):
-        FaultPlan.parse(text)
+        parse_plan(FaultPlan, [text])
 
 
 def test_a_plan_is_read_from_a_line() -> None:
-    assert FaultPlan.parse("drop=0.1,delay=0.2,delay_s=0.03") == FaultPlan(drop=0.1, delay=0.2, delay_s=0.03)
+    assert parse_plan(FaultPlan, ["drop=0.1", "delay=0.2", "delay_s=0.03"]) == FaultPlan(
+        drop=0.1, delay=0.2, delay_s=0.03
+    )

@@ -12,14 +12,13 @@ from pymavlink.dialects.v20 import common
 
 from edge.core.geometry import SE2
 from sim_hil.protocols.mavlink import telemetry
-from sim_hil.protocols.mavlink.modes import Mode
 from sim_hil.protocols.mavlink.node import MavlinkNode
 from sim_hil.protocols.mavlink.parameters import NAMES
-from sim_hil.protocols.mavlink.vehicle import Station
+from sim_hil.protocols.mavlink.vehicle import Mode, Station
 from sim_hil.protocols.mavlink.wire import Message, Reader, Writer
 from sim_hil.robots.carter.sensors import Sensors
-from tests.sim_hil.protocols.mavlink.test_mavlink_vehicle import FakeBase
 from tests.sim_hil.protocols.mavlink.test_mavlink_wire import setpoint
+from tests.support.robot.fake_base import FakeBase
 
 STATION = Station(255, ("127.0.0.1", 1))
 ACCEPTED, DENIED = common.MAV_RESULT_ACCEPTED, common.MAV_RESULT_DENIED
@@ -44,15 +43,15 @@ class Link:
         self.now_s = 0.0
         self.seen: list[Message] = []
 
-    def tell(self, *messages: Message) -> list[Message]:
-        """Send, and return what is answered at once."""
+    def send(self, *messages: Message) -> list[Message]:
+        """Send messages and return the immediate answers."""
         for message in messages:
-            for heard in self.reader.read(self._from_station.pack(message)):
-                self.node.receive(heard, STATION, self.now_s)
+            for received in self.reader.read(self._from_station.pack(message)):
+                self.node.receive(received, STATION, self.now_s)
         return self._over(self.node.answers())
 
     def run(self, seconds: float) -> list[Message]:
-        """Let time pass in steps of 2 ms; what it reports."""
+        """Let time pass in steps of 2 ms; return the reports."""
         seen = []
         for _ in range(round(seconds / 0.002)):
             self.now_s += 0.002
@@ -102,8 +101,8 @@ def test_reports_turn_the_bases_axes_into_those_of_mavlink(link: Link) -> None:
 
 
 @pytest.mark.parametrize("mode", list(Mode))
-def test_a_heartbeat_says_what_mode_it_is_in(link: Link, mode: Mode) -> None:
-    link.tell(setpoint(), command(common.MAV_CMD_DO_SET_MODE, 1, *mode.value))
+def test_a_heartbeat_contains_the_mode(link: Link, mode: Mode) -> None:
+    link.send(setpoint(), command(common.MAV_CMD_DO_SET_MODE, 1, *mode.value))
     beat = named(link.run(0.01), "HEARTBEAT")[-1]
     assert beat.custom_mode == mode.custom_mode and beat.type == common.MAV_TYPE_GROUND_ROVER
 
@@ -131,59 +130,59 @@ def test_a_heartbeat_says_what_mode_it_is_in(link: Link, mode: Mode) -> None:
     ],
 )
 def test_every_command_is_acknowledged(link: Link, asked: Message, expected: int) -> None:
-    assert result(link.tell(asked)) == expected
+    assert result(link.send(asked)) == expected
 
 
 def test_a_message_that_is_requested_follows_the_acknowledgement(link: Link) -> None:
-    answers = link.tell(command(common.MAV_CMD_REQUEST_MESSAGE, 148))
+    answers = link.send(command(common.MAV_CMD_REQUEST_MESSAGE, 148))
     assert [answer.get_type() for answer in answers] == ["COMMAND_ACK", "AUTOPILOT_VERSION"]
     assert answers[1].capabilities & common.MAV_PROTOCOL_CAPABILITY_MAVLINK2
 
 
-def test_a_rate_that_is_asked_for_is_kept_up_to_50_hz(link: Link) -> None:
+def test_a_requested_rate_is_limited_to_50_hz(link: Link) -> None:
     for interval_us, expected in ((100_000, 10), (1_000, 50), (-1, 0), (0, 20)):
-        link.tell(command(common.MAV_CMD_SET_MESSAGE_INTERVAL, 32, interval_us))
+        link.send(command(common.MAV_CMD_SET_MESSAGE_INTERVAL, 32, interval_us))
         assert len(named(link.run(1.0), "LOCAL_POSITION_NED")) == pytest.approx(expected, abs=1)
 
 
-def test_what_is_for_another_system_or_component_is_left_alone(link: Link) -> None:
+def test_messages_for_another_system_or_component_are_ignored(link: Link) -> None:
     for target in ((2, 1), (1, 154)):
         message = common.MAVLink_command_long_message(*target, 400, 0, 1, 0, 0, 0, 0, 0, 0)
-        assert link.tell(message) == [] and not link.node.vehicle.armed
+        assert link.send(message) == [] and not link.node.vehicle.armed
     assert link.reader.counts.not_for_us == 2
 
 
 def test_the_list_of_parameters_is_whole(link: Link) -> None:
-    link.tell(common.MAVLink_param_request_list_message(1, 1))
+    link.send(common.MAVLink_param_request_list_message(1, 1))
     assert [message.param_id for message in named(link.run(0.1), "PARAM_VALUE")] == list(NAMES)
 
 
 def test_a_parameter_is_read_by_name_and_by_index_and_answered_when_set(link: Link) -> None:
-    link.tell(common.MAVLink_param_request_read_message(1, 1, b"COM_OF_LOSS_T", -1))
-    link.tell(common.MAVLink_param_request_read_message(1, 1, b"", 0))
-    link.tell(common.MAVLink_param_set_message(1, 1, b"COM_OF_LOSS_T", 0.75, common.MAV_PARAM_TYPE_REAL32))
+    link.send(common.MAVLink_param_request_read_message(1, 1, b"COM_OF_LOSS_T", -1))
+    link.send(common.MAVLink_param_request_read_message(1, 1, b"", 0))
+    link.send(common.MAVLink_param_set_message(1, 1, b"COM_OF_LOSS_T", 0.75, common.MAV_PARAM_TYPE_REAL32))
     values = [(message.param_id, message.param_value) for message in named(link.run(0.1), "PARAM_VALUE")]
     assert [name for name, _ in values] == ["COM_OF_LOSS_T", NAMES[0], "COM_OF_LOSS_T"] and values[2][1] == 0.75
 
 
 def test_there_is_no_mission_and_none_is_taken(link: Link) -> None:
-    (count,) = link.tell(common.MAVLink_mission_request_list_message(1, 1))
+    (count,) = link.send(common.MAVLink_mission_request_list_message(1, 1))
     assert count.get_type() == "MISSION_COUNT" and count.count == 0
-    (ack,) = link.tell(common.MAVLink_mission_count_message(1, 1, 3))
+    (ack,) = link.send(common.MAVLink_mission_count_message(1, 1, 3))
     assert ack.type == common.MAV_MISSION_UNSUPPORTED
 
 
-def test_questions_of_time_are_answered_and_answers_are_not(link: Link) -> None:
+def test_time_requests_are_answered_and_answers_are_not(link: Link) -> None:
     link.run(0.5)
-    (answer,) = link.tell(common.MAVLink_timesync_message(0, 77))
+    (answer,) = link.send(common.MAVLink_timesync_message(0, 77))
     assert answer.ts1 == 77 and answer.tc1 == pytest.approx(0.5e9)
-    assert link.tell(common.MAVLink_timesync_message(5, 77)) == []
-    (back,) = link.tell(common.MAVLink_ping_message(1, 9, 0, 0))
+    assert link.send(common.MAVLink_timesync_message(5, 77)) == []
+    (back,) = link.send(common.MAVLink_ping_message(1, 9, 0, 0))
     assert back.seq == 9 and back.target_system == 255
 
 
-def test_a_setpoint_that_it_cannot_follow_is_counted_and_said_once(link: Link) -> None:
-    answers = link.tell(*[setpoint(mask=0)] * 5)
+def test_an_unusable_setpoint_is_counted_and_reported_once(link: Link) -> None:
+    answers = link.send(*[setpoint(mask=0)] * 5)
     assert link.reader.counts.unusable == 5
     assert [answer.get_type() for answer in answers] == ["STATUSTEXT"]
 
@@ -201,12 +200,12 @@ def test_any_content_of_any_message_is_harmless(chosen: list[tuple[tuple[int, ty
         head = bytes((0xFD, len(payload), 0, 0, 0, 255, 190)) + number.to_bytes(3, "little")
         crc = common.x25crc(head[1:] + payload)
         crc.accumulate(bytes((kind.crc_extra,)))  # type: ignore[attr-defined]
-        for heard in link.reader.read(head + payload + crc.crc.to_bytes(2, "little")):
+        for message in link.reader.read(head + payload + crc.crc.to_bytes(2, "little")):
             # To us, so that it is not left alone.
             for name, value in (("target_system", 1), ("target_component", 1), ("target", 1)):
-                if hasattr(heard, name):
-                    setattr(heard, name, value)
-            link.node.receive(heard, STATION, link.now_s)
+                if hasattr(message, name):
+                    setattr(message, name, value)
+            link.node.receive(message, STATION, link.now_s)
         link.run(0.004)
     assert link.reader.counts.broken == 0
     vx, _, wz = link.base.velocity

@@ -6,36 +6,14 @@ from math import radians
 
 import pytest
 
-from sim_hil.protocols.mavlink.modes import Mode
 from sim_hil.protocols.mavlink.parameters import Parameters
 from sim_hil.protocols.mavlink.setpoints import Setpoint, Sticks
-from sim_hil.protocols.mavlink.vehicle import ACCEPTED, FAILED, REJECTED, Health, Station, Vehicle
+from sim_hil.protocols.mavlink.vehicle import ACCEPTED, FAILED, REJECTED, Health, Mode, Station, Vehicle
+from tests.support.robot.fake_base import FakeBase
 
 FIRST, SECOND = Station(255, ("127.0.0.1", 1)), Station(254, ("127.0.0.1", 2))
 SAME_NUMBER = Station(255, ("127.0.0.1", 3))
 AHEAD = Setpoint(local=False, vx_mps=0.5, vy_mps=0.0, yaw_rate_radps=0.0)
-
-
-class FakeBase:
-    def __init__(self) -> None:
-        self.velocity = (0.0, 0.0, 0.0)
-        self.powered = self.stopped = False
-
-    def command(self, vx_mps: float, vy_mps: float, wz_radps: float) -> None:
-        self.velocity = (vx_mps, vy_mps, wz_radps)
-
-    def stand(self) -> None:
-        self.powered = True
-
-    def rest(self) -> None:
-        self.powered, self.velocity = False, (0.0, 0.0, 0.0)
-
-    def press_estop(self) -> None:
-        self.stopped = True
-        self.rest()
-
-    def release_estop(self) -> None:
-        self.stopped = False
 
 
 @pytest.fixture
@@ -87,7 +65,7 @@ def test_setpoints_that_end_stop_it_after_half_a_second(vehicle: Vehicle, base: 
     assert "no setpoints" in texts(vehicle)
 
 
-def test_setpoints_that_come_back_do_not_drive_it_until_it_is_asked_for(vehicle: Vehicle, base: FakeBase) -> None:
+def test_returning_setpoints_do_not_drive_it_until_offboard_mode_is_requested(vehicle: Vehicle, base: FakeBase) -> None:
     driving(vehicle)
     vehicle.step(0.6)
     vehicle.setpoint(FIRST, AHEAD, 0.7)
@@ -103,8 +81,8 @@ def test_a_station_that_falls_silent_stops_it_and_then_disarms_it(vehicle: Vehic
         vehicle.step(now_s)
         assert (base.velocity[0] == 0.5) == (now_s <= 3.5)
         assert vehicle.armed == (now_s <= 5.5)
-    said = texts(vehicle)
-    assert "lost, holding" in said and "lost, disarmed" in said
+    sent = texts(vehicle)
+    assert "lost, holding" in sent and "lost, disarmed" in sent
 
 
 def test_a_second_station_may_not_drive_or_arm_or_disarm_it(vehicle: Vehicle, base: FakeBase) -> None:
@@ -130,7 +108,7 @@ def test_only_the_station_that_a_parameter_names_may_drive(base: FakeBase) -> No
     assert vehicle.arm(FIRST, 0.0) == REJECTED and vehicle.arm(SECOND, 0.0) == ACCEPTED
 
 
-def test_anybody_may_stop_it_and_it_stays_stopped_until_a_disarm(vehicle: Vehicle, base: FakeBase) -> None:
+def test_every_station_may_stop_it_and_it_stays_stopped_until_a_disarm(vehicle: Vehicle, base: FakeBase) -> None:
     driving(vehicle)
     vehicle.emergency_stop("test")
     assert base.stopped and not vehicle.armed
@@ -139,7 +117,7 @@ def test_anybody_may_stop_it_and_it_stays_stopped_until_a_disarm(vehicle: Vehicl
     assert vehicle.arm(FIRST, 1.2) == ACCEPTED
 
 
-def test_a_button_that_is_held_down_stops_it_and_cannot_be_overlooked(vehicle: Vehicle, base: FakeBase) -> None:
+def test_a_pressed_button_stops_it_and_denies_arming(vehicle: Vehicle, base: FakeBase) -> None:
     driving(vehicle)
     vehicle.button = True
     vehicle.step(0.1)
@@ -177,6 +155,6 @@ def test_a_velocity_of_the_local_frame_is_followed_as_the_base_turns(vehicle: Ve
     driving(vehicle)
     vehicle.setpoint(FIRST, Setpoint(local=True, vx_mps=0.5, vy_mps=0.0), 0.0)
     assert base.velocity == pytest.approx((0.5, 0.0, 0.0))
-    vehicle.health = Health(yaw_rad=radians(90))  # it looks east, north is to its left
+    vehicle.health = Health(yaw_rad=radians(90))  # it faces east, north is to its left
     vehicle.step(0.1)
     assert base.velocity[0] == pytest.approx(0.0, abs=1e-9) and base.velocity[2] > 1.0

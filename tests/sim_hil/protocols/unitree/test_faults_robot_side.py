@@ -15,11 +15,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.core.geometry import SE2
-from sim_hil.protocols.unitree.drifting import DriftingOdometry
 from sim_hil.protocols.unitree.fault_commands import KINDS, FaultCommand, FaultCommandError, parse
 from sim_hil.protocols.unitree.fault_injector import FaultInjector
-from sim_hil.protocols.unitree.remote import Remote
-from sim_hil.protocols.unitree.state import LowStateMessage, OdometryFrame, sport_mode_state
+from sim_hil.protocols.unitree.odometry import DriftingOdometry, OdometryFrame
+from sim_hil.protocols.unitree.state import LowStateMessage, Remote, sport_mode_state
 from sim_hil.protocols.unitree.state_faults import StateFaults
 from sim_hil.robots.battery import Battery, load_w
 from sim_hil.robots.odometry_noise import LEVELS, NoiseLevel, OdometryNoise
@@ -64,7 +63,7 @@ def test_every_fault_survives_the_line_that_asks_for_it(name: str) -> None:
         b'{"fault": ["deaf"]}', b'{"fault": "state-loss", "percent": 1' + b"0" * 400 + b"}",
     ],
 )  # fmt: skip
-def test_a_line_that_asks_for_nothing_we_know_is_refused(line: bytes) -> None:
+def test_an_invalid_fault_line_is_refused(line: bytes) -> None:
     with pytest.raises(FaultCommandError):
         parse(line)
 
@@ -106,13 +105,13 @@ def test_a_biased_velocity_grows_along_the_heading() -> None:
 
 
 @pytest.mark.parametrize("field", ["position", "velocity", "rpy"])
-def test_a_poisoned_state_is_not_finite_where_it_says(field: str) -> None:
+def test_a_nan_is_in_the_requested_field(field: str) -> None:
     (out,) = faults_with("odometry-nan", field=field).deliver(state(), 0)
     poisoned = {"position": out.position, "velocity": out.velocity, "rpy": out.imu_state.rpy}
     assert [name for name, values in poisoned.items() if not all(map(math.isfinite, values))] == [field]
 
 
-def test_a_late_state_comes_when_its_delay_is_over_and_all_at_once_when_the_fault_ends() -> None:
+def test_a_late_state_is_sent_after_its_delay_or_when_the_fault_ends() -> None:
     faults = faults_with("odometry-lag", delay_s=0.3)
     first, second = state(1.0), state(2.0)
     assert faults.deliver(first, 0) == faults.deliver(second, 20 * MS) == []
@@ -132,7 +131,7 @@ def test_half_the_states_are_lost() -> None:
     assert 150 < kept < 250
 
 
-def test_neighbours_change_places_and_twins_come_twice() -> None:
+def test_states_are_swapped_or_sent_twice() -> None:
     faults = faults_with("state-reorder")
     first, second = state(1.0), state(2.0)
     assert faults.deliver(first, 0) == [] and faults.deliver(second, 0) == [second, first]
@@ -142,7 +141,7 @@ def test_neighbours_change_places_and_twins_come_twice() -> None:
 def test_a_tipped_robot_reports_it_in_both_states() -> None:
     faults = faults_with("tip-over", pitch_rad=0.8)
     (out,) = faults.deliver(state(), 0)
-    low = LowStateMessage().fill(standing(), AT_ORIGIN)
+    low = LowStateMessage().update(standing(), AT_ORIGIN)
     assert faults.alter_low(low)
     assert out.imu_state.rpy[1] == low.imu_state.rpy[1] == 0.8
     assert out.imu_state.quaternion == pytest.approx([math.cos(0.4), 0.0, math.sin(0.4), 0.0])
@@ -218,7 +217,7 @@ def injector(tmp_path: Path):
     injector.close()
 
 
-def test_the_asker_hears_of_the_effect_when_it_has_come(injector) -> None:
+def test_a_request_is_answered_when_the_fault_takes_effect(injector) -> None:
     server, client = injector
     client.send(command("odometry-bias").line())
     server.poll(1)
@@ -227,7 +226,7 @@ def test_the_asker_hears_of_the_effect_when_it_has_come(injector) -> None:
     assert json.loads(client.recv(500)) == {"fault": "odometry-bias", "on": True, "effect_ns": 5 * MS}
 
 
-def test_nonsense_is_answered_and_changes_nothing(injector) -> None:
+def test_an_invalid_request_is_answered_with_an_error(injector) -> None:
     server, client = injector
     client.send(b"nonsense")
     server.poll(1)

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.core.geometry import SE2
-from sim_hil.protocols.unitree.services.avoidance import RANGE_M, STOP_M, RangeFinder, allowed_mps, slowed, towards
+from sim_hil.protocols.unitree.services.avoidance import RANGE_M, STOP_M, RangeFinder, allowed_mps, slowed
 from sim_hil.robots.go2.sport import SportAction
 from sim_hil.scene.scene import Box
 from tests.support.robot.go2_services import Desk, Stage
@@ -44,12 +44,12 @@ class TestAvoidance:
         turned = Box((3.0 * c, 3.0 * s, 1.0), (c, s), (0.2, 4.0, 2.0))
         assert RangeFinder([turned]).free_m(0.0, 0.0, turn, self.nobody) == pytest.approx(2.9, abs=1e-6)
 
-    def test_what_is_beside_the_robot_is_in_its_way_and_what_is_further_out_is_not(self) -> None:
+    def test_only_obstacles_within_the_robots_width_count(self) -> None:
         finder = RangeFinder([Box((2.0, 0.3, 0.5), (1.0, 0.0), (0.2, 0.1, 1.0))])
         assert finder.free_m(0.0, 0.0, 0.0, self.nobody) == pytest.approx(1.9)
         assert finder.free_m(0.0, -0.1, 0.0, self.nobody) == RANGE_M
 
-    def test_a_lamp_above_and_a_stripe_on_the_floor_stop_nobody(self) -> None:
+    def test_a_lamp_above_and_a_stripe_on_the_floor_do_not_count(self) -> None:
         boxes = [Box((1.0, 0.0, z), (1.0, 0.0), (0.5, 4.0, 0.02)) for z in (0.01, 2.5)]
         assert RangeFinder(boxes).free_m(0.0, 0.0, 0.0, self.nobody) == RANGE_M
 
@@ -93,7 +93,7 @@ class TestAvoidance:
         desk.run(0.4)
         assert desk.behaviour.commanded == (0.0, 0.0, 0.0)
 
-    def test_its_moves_are_ignored_until_the_api_is_said_to_command(self, desk: Desk) -> None:
+    def test_its_moves_are_ignored_until_the_api_takes_command(self, desk: Desk) -> None:
         desk.avoid.handle(1003, '{"x": 0.4, "y": 0, "yaw": 0, "mode": 0}')
         assert desk.behaviour.commanded == (0.0, 0.0, 0.0)
 
@@ -144,9 +144,6 @@ class TestAvoidance:
         desk.behaviour.request(SportAction.RECOVERY_STAND)
         desk.run(4.0)
         assert desk.behaviour.ready and desk.behaviour.commanded == (0.0, 0.0, 0.0)
-
-    def test_there_is_no_way_to_where_one_is(self) -> None:
-        assert towards(SE2(1, 2, 3), SE2(1, 2, 3)) is None
 
     def test_the_sport_services_own_moves_are_slowed_once_it_avoids(self, desk: Desk) -> None:
         desk.free_m = 0.2

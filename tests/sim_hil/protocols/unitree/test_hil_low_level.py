@@ -64,26 +64,25 @@ def test_a_command_that_was_changed_on_the_way_is_ignored(joint: int, field: str
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_what_is_no_number_is_ignored_whatever_its_checksum(value: float) -> None:
+def test_a_command_with_a_non_finite_number_is_ignored(value: float) -> None:
     low = command()
     low.motor_cmd[3].tau = value
     low.crc = low_command_crc(low)
     assert motor_targets(low) is None
 
 
-def test_the_torque_is_that_of_the_makers_formula() -> None:
-    assert MotorTarget(True, 0.5, 1.0, 2.0, 10.0, 0.5).torque(0.2, 3.0) == pytest.approx(2.0 + 10 * 0.3 + 0.5 * -2.0)
-
-
 @pytest.mark.parametrize(
     ("target", "torque"),
     [
+        (MotorTarget(True, 0.5, 1.0, 2.0, 10.0, 0.5), 2.0 + 10 * 0.5 + 0.5 * 1.0),
         (MotorTarget(True, POSITION_STOP_RAD, 1.0, 2.0, 10.0, 0.5), 2.0 + 0.5 * 1.0),
         (MotorTarget(True, 0.5, VELOCITY_STOP_RADPS, 2.0, 10.0, 0.5), 2.0 + 10 * 0.5),
         (MotorTarget(False, 0.5, 1.0, 2.0, 10.0, 0.5), 0.0),
     ],
 )
-def test_a_stop_number_opens_its_loop_and_mode_0_the_motor(target: MotorTarget, torque: float) -> None:
+def test_the_torque_is_the_makers_formula_without_terms_that_are_switched_off(
+    target: MotorTarget, torque: float
+) -> None:
     assert target.torque(0.0, 0.0) == pytest.approx(torque)
 
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+import mmap
 import threading
+from collections.abc import Iterator
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,102 +14,60 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_bridge.unitree.messages import ids
+from firmware_bridge.unitree.messages.crc import low_state_crc
+from firmware_bridge.unitree.messages.idl_low import LowState_
 from firmware_bridge.unitree.rpc import move_parameter
 from sim_hil.protocols.snapshot import SnapshotReader, SnapshotWriter, TornSnapshotError
+from sim_hil.protocols.unitree.odometry import OdometryFrame
 from sim_hil.protocols.unitree.services.service import Received
-from sim_hil.protocols.unitree.services.sport import CommandLog, handle_sport, parse_move
-from sim_hil.protocols.unitree.state import OdometryFrame
-from sim_hil.robots.go2.sport import SportAction
-
-
-class Recorder:
-    """A robot that notes what the sport service makes of a request."""
-
-    def __init__(self) -> None:
-        self.did: list[object] = []
-
-    def sport(self, action: SportAction) -> int:
-        self.did.append(action)
-        return 0
-
-    def move(self, *velocity: float) -> None:
-        self.did.append(velocity)
+from sim_hil.protocols.unitree.services.sport import RequestLog, handle_sport, parse_move
+from sim_hil.protocols.unitree.state import LowStateMessage
+from sim_hil.robots.battery import BatteryReading
+from tests.support.robot.fake_go2 import standing
 
 
 class TestSportRules:
-    @pytest.mark.parametrize(
-        ("api_id", "action"),
-        [(1001, "DAMP"), (1002, "BALANCE_STAND"), (1003, "STOP_MOVE"), (1004, "STAND_UP"), (1005, "STAND_DOWN"),
-         (1006, "RECOVERY_STAND")],
-    )  # fmt: skip
-    def test_each_id_is_its_action(self, api_id: int, action: str) -> None:
-        robot = Recorder()
-        assert handle_sport(robot, api_id, "") == (0, "")
-        assert robot.did == [SportAction[action]]
-
-    @pytest.mark.parametrize("api_id", [0, 1007, 1009, 1016, 1030, 2043, 9999])
-    def test_anything_else_is_not_implemented(self, api_id: int) -> None:
-        robot = Recorder()
-        assert handle_sport(robot, api_id, "{}") == (3203, "")
-        assert robot.did == []
-
-    def test_move_takes_three_numbers(self) -> None:
-        robot = Recorder()
-        assert handle_sport(robot, 1008, '{"x": 0.5, "y": 0, "z": -1}') == (0, "")
-        assert robot.did == [(0.5, 0.0, -1.0)]
-
     @pytest.mark.parametrize(
         "text",
         ["", "nonsense", "[]", "3", "null", '{"x":1,"y":2}', '{"x":1,"y":2,"z":"3"}', '{"x":1,"y":2,"z":NaN}',
          '{"x":1,"y":2,"z":1e999}', '{"x":true,"y":0,"z":0}', '{"x":1,"y":2,"z":null}', "[" * 4000],
     )  # fmt: skip
-    def test_a_bad_move_is_a_parameter_error_and_moves_nothing(self, text: str) -> None:
-        robot = Recorder()
+    def test_an_invalid_move_is_a_parameter_error_and_moves_nothing(self, text: str) -> None:
+        robot = SimpleNamespace(move=lambda *_: pytest.fail("moved"))
         assert handle_sport(robot, 1008, text) == (3204, "")
-        assert robot.did == []
 
     @given(st.text(max_size=200))
     def test_no_text_breaks_the_parser(self, text: str) -> None:
         assert parse_move(text) is None or len(parse_move(text) or ()) == 3
 
     @given(*[st.floats(-100, 100)] * 3)
-    def test_the_bridges_parameter_is_understood(self, vx: float, vy: float, wz: float) -> None:
+    def test_the_bridges_parameter_is_parsed(self, vx: float, vy: float, wz: float) -> None:
         assert parse_move(move_parameter(vx, vy, wz)) == (vx, vy, wz)
 
 
-class TestCommandLog:
-    @staticmethod
-    def after(*requests: tuple[int, str]) -> dict[str, object]:
-        log = CommandLog()
-        for api_id, parameter in requests:
-            log.note(Received(0, ids.SPORT_SERVICE, api_id, parameter, 0, noreply=True))
-        return log.summary()
+MOVE, ZERO_MOVE, OTHER = (1008, '{"x":0.5,"y":0,"z":0}'), (1008, '{"x":0,"y":0,"z":0}'), (1016, "")
 
-    def test_moves_are_counted_and_the_last_is_kept(self) -> None:
-        summary = self.after((1008, '{"x":1,"y":0,"z":0}'), (1008, '{"x":0,"y":0,"z":0}'))
-        assert (summary["commands"], summary["last_move"], summary["last_command_zero"]) == (2, [0.0, 0.0, 0.0], True)
 
-    def test_a_moving_robot_is_not_at_zero(self) -> None:
-        assert self.after((1008, '{"x":0,"y":0,"z":0.1}'))["last_command_zero"] is False
-
-    def test_stop_move_after_a_move_is_zero(self) -> None:
-        summary = self.after((1008, '{"x":1,"y":0,"z":0}'), (1003, ""))
-        assert (summary["last_command"], summary["last_command_zero"]) == ("StopMove", True)
-
-    def test_a_move_that_nobody_can_read_does_not_count_as_zero(self) -> None:
-        assert self.after((1008, "?"))["last_command_zero"] is False
-
-    @pytest.mark.parametrize("api_id", [1002, 1004, 1006, 1016, 9999])
-    def test_a_move_stays_in_force_whatever_is_said_after_it_that_is_no_motion(self, api_id: int) -> None:
-        summary = self.after((1008, '{"x":0.5,"y":0,"z":0}'), (api_id, ""))
-        assert (summary["last_move"], summary["last_command_zero"]) == ([0.5, 0.0, 0.0], False)
-
-    @pytest.mark.parametrize("api_id", [1001, 1003, 1005])
-    def test_what_ends_a_motion_is_zero_also_when_something_else_follows(self, api_id: int) -> None:
-        assert self.after((1008, '{"x":0.5,"y":0,"z":0}'), (api_id, ""), (1016, ""))["last_command_zero"] is True
-
-    def test_a_robot_that_was_never_told_to_move_is_at_zero(self) -> None:
-        assert self.after((1004, ""))["last_command_zero"] is True
+@pytest.mark.parametrize(
+    ("requests", "at_zero"),
+    [
+        ([], True),
+        ([(1004, "")], True),
+        ([MOVE], False),
+        ([(1008, "?")], False),
+        ([MOVE, ZERO_MOVE], True),
+        *[([MOVE, (api_id, ""), OTHER], True) for api_id in (1001, 1003, 1005)],
+        *[([MOVE, (api_id, "")], False) for api_id in (1002, 1004, 1006, 1016, 9999)],
+    ],
+)
+def test_a_move_counts_until_a_zero_move_or_a_request_that_ends_motion(
+    requests: list[tuple[int, str]], at_zero: bool
+) -> None:
+    log = RequestLog()
+    for api_id, parameter in requests:
+        log.note(Received(0, ids.SPORT_SERVICE, api_id, parameter, 0, noreply=True))
+    assert log.summary()["last_command_zero"] is at_zero
+    assert log.summary()["commands"] == sum(api_id == 1008 for api_id, _ in requests)
 
 
 class TestOdometryFrame:
@@ -128,43 +89,70 @@ class TestOdometryFrame:
         assert OdometryFrame(start).position(ahead) == pytest.approx([distance, 0, 0.3], abs=1e-9)
 
 
+@given(st.integers(0, 2**32 - 1))
+def test_the_low_state_is_encoded_as_the_binding_would_and_reads_back(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth = standing(
+        time_s=float(rng.uniform(0, 1e5)),
+        joint_q_rad=rng.normal(size=12),
+        joint_dq_radps=rng.normal(size=12),
+        joint_tau_nm=rng.normal(size=12) * 20,
+        gyro_radps=rng.normal(size=3),
+        foot_force_n=rng.uniform(0, 200, 4),
+    )
+    low = LowStateMessage()
+    low.charge(BatteryReading(float(rng.uniform(0, 100)), 29.5, float(rng.uniform(0, 20))))
+    message = low.update(truth, OdometryFrame((1.0, 2.0, 0.5)))
+    message.wireless_remote = rng.bytes(40)
+    message.bit_flag, message.reserve = int(rng.integers(256)), int(rng.integers(2**32))
+    data = low.encode()
+    assert data == message.serialize()
+    read = LowState_.deserialize(data)
+    assert read.crc == message.crc == low_state_crc(read)
+    assert read.tick == message.tick
+
+
 class TestSnapshot:
-    def test_the_newest_value_is_read(self) -> None:
-        writer = SnapshotWriter(5)
-        reader = SnapshotReader(writer.fd, 5)
+    @pytest.fixture
+    def pair(self) -> Iterator[tuple[SnapshotWriter, SnapshotReader]]:
+        writer = SnapshotWriter(2)
+        reader = SnapshotReader(writer.fd, 2)
+        yield writer, reader
+        reader.close()
+        writer.close()
+
+    @staticmethod
+    def half_written(writer: SnapshotWriter) -> None:
+        with mmap.mmap(writer.fd, 0) as memory:
+            memory[-8:] = np.array(3.0).tobytes()
+
+    def test_the_newest_value_is_read(self, pair: tuple[SnapshotWriter, SnapshotReader]) -> None:
+        writer, reader = pair
         assert reader.read() is None
         for value in range(3):
-            writer.write(np.full(5, float(value)))
-        assert reader.read().tolist() == [2.0] * 5
-        reader.close()
-        writer.close()
+            writer.write(np.full(2, float(value)))
+        assert reader.read().tolist() == [2.0] * 2
 
-    def test_a_torn_value_is_never_returned(self) -> None:
-        writer = SnapshotWriter(2)
-        reader = SnapshotReader(writer.fd, 2)
+    def test_a_torn_value_is_never_returned(self, pair: tuple[SnapshotWriter, SnapshotReader]) -> None:
+        writer, reader = pair
         writer.write(np.array((1.0, 2.0)))
-        writer._memory[-8:] = np.array(3.0).tobytes()  # the next value, half-written
+        self.half_written(writer)
         with pytest.raises(TornSnapshotError, match="no consistent snapshot"):
             reader.read()
-        reader.close()
-        writer.close()
 
-    def test_a_writer_that_was_interrupted_for_a_few_milliseconds_is_waited_for(self) -> None:
-        writer = SnapshotWriter(2)
-        reader = SnapshotReader(writer.fd, 2)
+    def test_the_reader_waits_for_a_writer_interrupted_for_milliseconds(
+        self, pair: tuple[SnapshotWriter, SnapshotReader]
+    ) -> None:
+        writer, reader = pair
         writer.write(np.array((1.0, 2.0)))
-        writer._memory[-8:] = np.array(3.0).tobytes()
-        back = threading.Timer(0.02, writer.write, (np.array((1.0, 3.0)),))
-        back.start()
+        self.half_written(writer)
+        timer = threading.Timer(0.02, writer.write, (np.array((1.0, 3.0)),))
+        timer.start()
         assert reader.read().tolist() == [1.0, 3.0]
-        back.join()
-        reader.close()
-        writer.close()
+        timer.join()
 
-    def test_another_length_is_refused(self) -> None:
-        writer = SnapshotWriter(3)
+    def test_another_length_is_refused(self, pair: tuple[SnapshotWriter, SnapshotReader]) -> None:
         with pytest.raises(ValueError, match="shape"):
-            writer.write(np.zeros(4))
+            pair[0].write(np.zeros(4))
         with pytest.raises(ValueError, match="bytes"):
-            SnapshotReader(writer.fd, 4)
-        writer.close()
+            SnapshotReader(pair[0].fd, 4)

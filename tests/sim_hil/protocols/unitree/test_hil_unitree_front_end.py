@@ -11,7 +11,7 @@ import pytest
 from firmware_bridge.unitree.dds import Bus, take_each
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.messages.idl import SportModeState_
-from firmware_bridge.unitree.messages.state import robot_state
+from firmware_bridge.unitree.report import robot_state
 from firmware_bridge.unitree.rpc import RpcClient, move_parameter
 from sim_hil.protocols.unitree import front_end
 from sim_hil.protocols.unitree.front_end import UnitreeFrontEnd, open_front_end
@@ -73,7 +73,7 @@ class TestUnitree(FrontEndContract):
         rig.close()
 
 
-def test_what_was_opened_is_closed_in_reverse_when_a_later_step_fails(
+def test_opened_resources_are_closed_in_reverse_if_a_later_step_fails(
     dds_domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     closed: list[str] = []
@@ -89,7 +89,7 @@ def test_what_was_opened_is_closed_in_reverse_when_a_later_step_fails(
 
     close_bus = front_end.Bus.close
     monkeypatch.setattr(front_end.Bus, "close", lambda bus: (closed.append("bus"), close_bus(bus)))
-    monkeypatch.setattr(front_end, "CameraProcess", Camera)
+    monkeypatch.setattr(front_end, "RenderProcess", Camera)
     monkeypatch.setattr(front_end, "StatePublishers", fails)
     asked = options("go2", domain=dds_domain, camera_size=(64, 48), faults=tmp_path / "faults")
     simulation = Simulation(asked.scene, people=0, seed=0)

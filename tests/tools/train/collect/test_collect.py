@@ -9,26 +9,28 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from export.core.typed import FieldError
+from export.core.typed import plain
+from export.model.config import PRESETS
 from sim_hil.benchmark.language.instructions import is_held_out
 from sim_hil.benchmark.policies.select import robot_config
 from tests.support.train.train_fake_worker import BEGUN
-from tools.train.collect import collect, collection
-from tools.train.collect.collection import CollectError, CollectFailedError, Collection, fill, job_count
-from tools.train.collect.dagger_driver import PolicyOptions
+from tools.train.collect import collection
+from tools.train.collect.collection import Collection, collect, fill
 from tools.train.collect.worker import Draw, Order, messages
+from tools.train.config.checks import TrainError
 from tools.train.config.collect import CollectConfig
-from tools.train.config.evaluate import EvaluateConfig
+from tools.train.config.recipe import Recipe
+from tools.train.config.rl import EvaluateConfig
 from tools.train.drives.dataset import DatasetWriter
 from tools.train.drives.drive import Dataset, Drive
-from tools.train.run.distributed import Ranks
-from tools.train.run.job import QuietProgress
-from tools.train.scenes.scenarios import KEPT_SEEDS
+from tools.train.drives.scenarios import KEPT_SEEDS
+from tools.train.run.distributed import SINGLE, Ranks
+from tools.train.run.job import StageFailedError, StageJob
+from tools.train.run.run_dir import RunDir
 
 FAKE = (sys.executable, "-m", "tests.support.train.train_fake_worker")
 Faulty = Callable[..., None]
@@ -80,23 +82,12 @@ def test_a_collection_that_was_ended_goes_on_to_the_same_data_set(tmp_path: Path
     assert _collect(tmp_path, jobs=2).sha256 == whole.sha256
 
 
-def test_a_data_set_that_is_whole_starts_no_process(whole: Dataset) -> None:
-    with DatasetWriter(whole.folder) as writer:
-        fill(writer, _collection(), 2, command=("/no/such/program",))
-
-
 def test_only_the_drive_whose_file_is_damaged_is_made_again(tmp_path: Path, whole: Dataset) -> None:
     shutil.copytree(whole.folder, tmp_path, dirs_exist_ok=True)
     (tmp_path / BEGUN).unlink()
     replace(whole, folder=tmp_path).path("e00009").write_bytes(b"damaged")
     assert _collect(tmp_path).sha256 == whole.sha256
     assert _begun(tmp_path) == ["e00009"]
-
-
-def test_more_drives_may_be_asked_for_later(tmp_path: Path, whole: Dataset) -> None:
-    few = _collect(tmp_path, count=5)
-    more = _collect(tmp_path)
-    assert few.ids == more.ids[:5] and more.sha256 == whole.sha256
 
 
 # -- what goes wrong --------------------------------------------------------------------------------------------------
@@ -126,19 +117,19 @@ def test_a_process_that_ends_badly_after_its_last_drive_costs_nothing(tmp_path: 
 
 def test_a_process_that_never_begins_ends_the_collection_with_its_last_words(tmp_path: Path, faulty: Faulty) -> None:
     faulty(deaf=True)
-    with pytest.raises(CollectFailedError, match=r"e00000 .* exit code 5: no hands"):
+    with pytest.raises(StageFailedError, match=r"e00000 .* exit code 5: no hands"):
         _collect(tmp_path, count=8)
 
 
 def test_a_refusal_ends_the_collection(tmp_path: Path, faulty: Faulty) -> None:
     faulty(refuse=True)
-    with pytest.raises(CollectFailedError, match="not these artifacts"):
+    with pytest.raises(StageFailedError, match="not these artifacts"):
         _collect(tmp_path, count=8)
 
 
 def test_when_most_drives_give_nothing_it_says_so_instead_of_going_on(tmp_path: Path, faulty: Faulty) -> None:
     faulty(drop=[f"e{number:05d}" for number in range(80)])
-    with pytest.raises(CollectFailedError, match="gave nothing to learn, the last: it left the way"):
+    with pytest.raises(StageFailedError, match="gave nothing to learn, the last: it left the way"):
         _collect(tmp_path, count=80)
 
 
@@ -152,36 +143,12 @@ def test_no_process_is_left_behind(tmp_path: Path, faulty: Faulty, monkeypatch: 
             opened.append(self)
 
     monkeypatch.setattr(collection, "Workers", Watched)
-    with pytest.raises(CollectFailedError):
+    with pytest.raises(StageFailedError):
         _collect(tmp_path)
     assert [workers.running() for workers in opened] == [0]
 
 
 # -- orders and draws -------------------------------------------------------------------------------------------------
-
-
-def test_an_order_travels_as_json() -> None:
-    policy = PolicyOptions("out/artifacts", "ab" * 32, 0.5, 2.0)
-    collected = replace(_collection(kinds={"office": 1.0}), policy=policy)
-    for order in collected.orders(Path("folder"), lambda _: False):
-        assert Order.of_json(json.loads(json.dumps(order.as_json()))) == order
-
-
-def test_an_order_with_an_unknown_key_is_refused() -> None:
-    order = _collection().orders(Path("folder"), lambda _: False)[0]
-    with pytest.raises(FieldError, match="colour"):
-        Order.of_json({**order.as_json(), "colour": "red"})
-
-
-def test_the_number_of_jobs_is_in_no_order() -> None:
-    one, four = (_collection(jobs=jobs).orders(Path("folder"), lambda _: False) for jobs in (1, 4))
-    assert one == four
-
-
-def test_another_turn_of_the_same_run_has_other_scenarios() -> None:
-    one = _collection().orders(Path("folder"), lambda _: False)[0]
-    other = replace(_collection(), turn=1).orders(Path("folder"), lambda _: False)[0]
-    assert one.scenario_seed != other.scenario_seed and one.seed != other.seed
 
 
 def test_nothing_is_collected_from_what_evaluation_and_reinforcement_learning_drive_in() -> None:
@@ -203,18 +170,8 @@ def test_what_is_drawn_has_the_shares_that_were_asked_for() -> None:
     assert {draw.camera.jpeg_quality for draw in draws} == set(range(80, 96))
 
 
-def test_a_draw_depends_on_the_seed_and_the_number_alone() -> None:
-    config = CollectConfig()
-    assert Draw.of(config, 7, 12) == Draw.of(config, 7, 12)
-    assert len({(Draw.of(config, seed, 12)) for seed in range(30)}) > 5
-
-
 def test_the_expert_drives_no_faster_than_a_policy_may() -> None:
     assert CollectConfig().speed_mps <= robot_config().limits.vx_max_mps
-
-
-def test_all_cores_are_used_unless_a_number_is_asked_for() -> None:
-    assert job_count(3) == 3 and job_count(0) >= 1
 
 
 # -- the real thing ---------------------------------------------------------------------------------------------------
@@ -224,9 +181,9 @@ def test_a_real_drive_is_made_of_a_training_scenario_and_is_the_same_in_any_proc
     config = CollectConfig(episodes=1, kinds={"corridor": 1.0}, noise_share=0.0)
     with DatasetWriter(tmp_path / "here") as here, DatasetWriter(tmp_path / "process") as there:
         order = Order(str(here.folder), "e", 7, 3, 0, 1, (), config)
-        begun, made = list(messages(order.as_json()))
+        begun, made = list(messages(plain(order)))
         workers, told = collection.Workers(collection.WORKER, 1), []
-        workers.start("e", replace(order, folder=str(there.folder)).as_json(), tmp_path / "e.log")
+        workers.start("e", plain(replace(order, folder=str(there.folder))), tmp_path / "e.log")
         while workers.running():
             told += [each.message for each in workers.wait(1.0)]
         workers.close()
@@ -239,31 +196,16 @@ def test_a_real_drive_is_made_of_a_training_scenario_and_is_the_same_in_any_proc
 
 def test_the_stage_collects_what_the_recipe_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(collection.fill, "__kwdefaults__", {**collection.fill.__kwdefaults__, "command": FAKE})
-    result = collect.run(_job(tmp_path))
+    result = collect(_job(tmp_path))
     assert result["drives"] == 3 and result["sha256"] == Dataset.open(tmp_path / "collect").sha256
     json.dumps(result)
 
 
-def test_its_budget_is_its_drives() -> None:
-    recipe: Any = SimpleNamespace(collect=CollectConfig(episodes=7))
-    assert [samples for _, samples, _ in collect.budget(recipe)] == [7]
-
-
 def test_under_torchrun_it_refuses(tmp_path: Path) -> None:
-    with pytest.raises(CollectError, match="without torchrun"):
-        collect.run(_job(tmp_path, ranks=Ranks(0, 2)))
+    with pytest.raises(TrainError, match="without torchrun"):
+        collect(_job(tmp_path, ranks=Ranks(0, 2)))
 
 
-def _job(folder: Path, ranks: Ranks | None = None) -> Any:
-    def stage(name: str) -> Path:
-        (folder / name).mkdir(exist_ok=True)
-        return folder / name
-
-    return SimpleNamespace(
-        recipe=SimpleNamespace(collect=CollectConfig(episodes=3, jobs=1)),
-        run_dir=SimpleNamespace(stage=stage),
-        seed=5,
-        ranks=ranks if ranks is not None else Ranks(),
-        progress=QuietProgress(),
-        should_stop=lambda: False,
-    )
+def _job(folder: Path, ranks: Ranks = SINGLE) -> StageJob:
+    recipe = Recipe("test", 1, PRESETS["nano"], collect=CollectConfig(episodes=3, jobs=1))
+    return StageJob(recipe, RunDir(folder), seed=5, ranks=ranks)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,24 +13,24 @@ from numpy.typing import NDArray
 from edge.artifacts.files import ArtifactError
 from edge.artifacts.manifest import Artifacts
 from edge.core.geometry import SE2
+from export.model.config import PRESETS
 from sim_hil.benchmark.env.observation import Observation
 from sim_hil.benchmark.env.world import EpisodeWorld
 from sim_hil.benchmark.policies.artifacts_policy import ArtifactsPolicy
 from sim_hil.benchmark.policies.expert import ExpertPolicy
 from sim_hil.scene.scene import load_scene
 from tests.support.benchmark.benchmark_episodes import corridor_episode
-from tests.support.train.training_drives import dataset, drive
-from tools.train.collect import dagger
-from tools.train.collect.collection import CollectError, Collection
-from tools.train.collect.dagger_driver import LONGEST_S, SHORTEST_S, PolicyDriver, PolicyOptions, draw_latency
+from tests.support.train.train_drives import dataset, drive
+from tools.train.collect import collection
+from tools.train.collect.collection import Collection
 from tools.train.collect.record import CameraSettings, DrivePlan, record
-from tools.train.collect.steering import Velocity
-from tools.train.config.collect import CollectConfig, DaggerConfig
-from tools.train.drives.drive import EXPERT, FUTURE_STEPS, POLICY, DriveError
-from tools.train.run import own_drives
-from tools.train.run.distributed import Ranks
-from tools.train.run.job import QuietProgress
-from tools.train.run.run_dir import RunDir
+from tools.train.collect.steering import SHORTEST_S, PolicyDriver, PolicyOptions, Velocity, draw_latency
+from tools.train.config.checks import TrainError
+from tools.train.config.collect import DaggerConfig
+from tools.train.config.recipe import Recipe
+from tools.train.drives.drive import EXPERT, FUTURE_STEPS, POLICY
+from tools.train.run.job import StageJob
+from tools.train.run.run_dir import RunDir, drives_after
 
 # -- delays -----------------------------------------------------------------------------------------------------------
 
@@ -40,21 +39,6 @@ def test_each_drive_has_a_delay_of_its_own_within_the_bounds() -> None:
     means = [draw_latency(2.0, np.random.default_rng(seed)).mean_s for seed in range(300)]
     assert 0.8 * SHORTEST_S < min(means) < 1.0 and 3.5 < max(means) < 4.8
     assert np.mean(means) == pytest.approx((SHORTEST_S + 4.0) / 2, abs=0.2)
-
-
-def test_no_delay_is_drawn_about_a_mean_of_more_than_six_seconds() -> None:
-    means = [draw_latency(10.0, np.random.default_rng(seed)).mean_s for seed in range(200)]
-    assert max(means) < 1.15 * LONGEST_S
-
-
-def test_the_times_of_one_drive_differ_a_little() -> None:
-    profile = draw_latency(2.0, np.random.default_rng(1))
-    assert 1.05 < max(profile.generation_s) / min(profile.generation_s) < 1.7
-
-
-def test_options_that_make_no_sense_are_refused() -> None:
-    with pytest.raises(ValueError, match="beta"):
-        PolicyOptions("a", "b", 1.5, 2.0)
 
 
 # -- a drive ----------------------------------------------------------------------------------------------------------
@@ -120,36 +104,20 @@ def test_other_artifacts_than_the_rounds_are_refused(artifacts: Artifacts) -> No
 def filled(monkeypatch: pytest.MonkeyPatch) -> list[Collection]:
     """What would have been collected."""
     asked: list[Collection] = []
-    monkeypatch.setattr(dagger, "fill", lambda writer, what, jobs, **rest: asked.append(what))
+    monkeypatch.setattr(collection, "fill", lambda writer, what, jobs, **rest: asked.append(what))
     return asked
 
 
-def _job(folder: Path, ranks: Ranks | None = None) -> Any:
-    return SimpleNamespace(
-        recipe=SimpleNamespace(collect=CollectConfig(), dagger=DaggerConfig(rounds=2, episodes=30, latency_mean_s=1.5)),
-        run_dir=RunDir(folder),
-        seed=5,
-        ranks=ranks if ranks is not None else Ranks(),
-        progress=QuietProgress(),
-        should_stop=lambda: False,
-    )
-
-
-def test_a_round_is_the_recipes_number_of_drives_by_these_artifacts(
-    tmp_path: Path, artifacts: Artifacts, filled: list[Collection]
-) -> None:
-    result = dagger.run_round(_job(tmp_path), artifacts.directory, 1)
-    (asked,) = filled
-    assert (asked.prefix, asked.count) == ("d1-", 30) and asked.policy is not None
-    assert asked.policy.latency_mean_s == 1.5 and asked.policy.manifest_sha256 == artifacts.manifest_sha256
-    assert result["policy"] == artifacts.manifest_sha256
+def _job(folder: Path, **dagger: Any) -> StageJob:
+    config = DaggerConfig(**{"rounds": 2, "episodes": 30, "latency_mean_s": 1.5, **dagger})
+    return StageJob(Recipe("test", 1, PRESETS["nano"], dagger=config), RunDir(folder), seed=5)
 
 
 def test_the_expert_helps_less_in_every_round_and_drives_other_scenarios(
     tmp_path: Path, artifacts: Artifacts, filled: list[Collection]
 ) -> None:
     for number in (1, 2, 3):
-        dagger.run_round(_job(tmp_path), artifacts.directory, number)
+        collection.run_round(_job(tmp_path), artifacts.directory, number)
     assert [asked.policy.beta for asked in filled if asked.policy is not None] == [0.5, 0.25, 0.125]
     seeds = {asked.orders(tmp_path, lambda _: False)[0].scenario_seed for asked in filled}
     assert len(seeds) == 3
@@ -159,26 +127,20 @@ def test_a_round_that_was_begun_with_other_artifacts_is_not_gone_on_with(
     tmp_path: Path, artifacts: Artifacts, filled: list[Collection]
 ) -> None:
     dataset(tmp_path / "collect", drive("d1-00000", frames=20, driver="policy:0123456789ab"))
-    with pytest.raises(CollectError, match="the same artifacts"):
-        dagger.run_round(_job(tmp_path), artifacts.directory, 1)
+    with pytest.raises(TrainError, match="the same artifacts"):
+        collection.run_round(_job(tmp_path), artifacts.directory, 1)
     assert not filled
-
-
-def test_the_counts_are_of_the_round_alone(tmp_path: Path, artifacts: Artifacts, filled: list[Collection]) -> None:
-    dataset(tmp_path / "collect", drive("e00000", frames=20))
-    assert dagger.run_round(_job(tmp_path), artifacts.directory, 2)["drives"] == 0
 
 
 def test_new_drives_of_the_expert_come_with_a_round_in_layouts_of_their_own(
     tmp_path: Path, artifacts: Artifacts, filled: list[Collection]
 ) -> None:
-    job = _job(tmp_path)
-    job.recipe.dagger = DaggerConfig(rounds=2, episodes=30, expert_episodes=7)
-    result = dagger.run_round(job, artifacts.directory, 1)
+    job = _job(tmp_path, expert_episodes=7)
+    result = collection.run_round(job, artifacts.directory, 1)
     shown, driven = filled
     assert (shown.prefix, shown.count, shown.policy) == ("n1-", 7, None) and driven.policy is not None
     assert result["expert"]["drives"] == 0
-    dagger.run_round(job, artifacts.directory, 2)
+    collection.run_round(job, artifacts.directory, 2)
     assert len({asked.orders(tmp_path, lambda _: False)[0].scenario_seed for asked in filled}) == 4
 
 
@@ -186,29 +148,17 @@ def test_new_drives_of_the_expert_come_with_a_round_in_layouts_of_their_own(
 def test_what_goes_on_learns_from_all_drives_or_from_the_newest_rounds(
     tmp_path: Path, newest_only: bool, seen: tuple[str, ...]
 ) -> None:
-    job = _job(tmp_path)
-    job.recipe.dagger = DaggerConfig(newest_only=newest_only)
+    job = _job(tmp_path, newest_only=newest_only)
     for number in (0, 1):
         job.run_dir.finish(f"sft-{number}", {})
     dataset(tmp_path / "collect", *(drive(name, frames=20) for name in ("e0", "d1-0", "d2-0", "n2-0")))
-    assert own_drives.drives_after(job, "sft").ids == seen
-    assert len(own_drives.drives_after(job, "imitate").ids) == 4  # no round has come before it
+    assert drives_after(job.run_dir, job.recipe, "sft").ids == seen
+    assert len(drives_after(job.run_dir, job.recipe, "imitate").ids) == 4  # no round has come before it
 
 
 def test_a_round_without_drives_is_not_learned_from(tmp_path: Path) -> None:
-    job = _job(tmp_path)
-    job.recipe.dagger = DaggerConfig(newest_only=True)
+    job = _job(tmp_path, newest_only=True)
     job.run_dir.finish("sft-0", {})
     dataset(tmp_path / "collect", drive("e0", frames=20))
-    with pytest.raises(DriveError, match="d1- or n1-"):
-        own_drives.drives_after(job, "sft")
-
-
-def test_under_torchrun_it_refuses(tmp_path: Path, artifacts: Artifacts) -> None:
-    with pytest.raises(CollectError, match="without torchrun"):
-        dagger.run_round(_job(tmp_path, Ranks(0, 2)), artifacts.directory, 1)
-
-
-def test_rounds_count_from_one(tmp_path: Path, artifacts: Artifacts) -> None:
-    with pytest.raises(ValueError, match="from 1"):
-        dagger.run_round(_job(tmp_path), artifacts.directory, 0)
+    with pytest.raises(TrainError, match="d1- or n1-"):
+        drives_after(job.run_dir, job.recipe, "sft")

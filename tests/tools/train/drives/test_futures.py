@@ -10,9 +10,9 @@ import pytest
 from edge.core.geometry import SE2
 from sim_hil.benchmark.policies.expert_motion import STEP_S, STEPS, Choice
 from sim_hil.benchmark.policies.expert_route import SPACING_M
-from tests.support.train.training_drives import arc
-from tools.train.drives.drive import EXPERT, FUTURE_STEPS, NOISE, POLICY
-from tools.train.drives.futures import chosen_future, driven_future, label_futures, relative
+from tests.support.train.train_drives import arc
+from tools.train.drives.drive import EXPERT, FUTURE_STEPS, NOISE
+from tools.train.drives.futures import chosen_future, label_futures, relative
 
 AHEAD = np.stack((np.arange(0.0, 10.0, SPACING_M), np.zeros(100)), axis=1)
 
@@ -33,13 +33,6 @@ def _choice(
 
 
 # -- what was chosen --------------------------------------------------------------------------------------------------
-
-
-def test_a_plan_straight_ahead_is_a_step_of_a_tenth_of_its_speed_each_tenth_of_a_second() -> None:
-    future = chosen_future(SE2(0.0, 0.0, 0.0), _choice(0.8), AHEAD)
-    assert future.shape == (FUTURE_STEPS, 3)
-    assert np.allclose(future[:, 0], 0.08 * np.arange(1, 51), atol=1e-9)
-    assert np.allclose(future[:, 1:], 0.0, atol=1e-9)
 
 
 def test_where_the_plan_says_where_it_is_the_label_is_the_plan() -> None:
@@ -74,16 +67,6 @@ def test_after_the_plan_it_goes_on_along_a_way_that_bends() -> None:
     assert future[49] == pytest.approx((3.4, 0.6, np.pi / 2), abs=0.15)
 
 
-def test_who_waits_goes_on_waiting() -> None:
-    future = chosen_future(SE2(0.0, 0.0, 0.0), _choice(0.0), AHEAD)
-    assert np.allclose(future, 0.0)
-
-
-def test_beside_the_way_it_stays_as_far_beside_it() -> None:
-    future = chosen_future(SE2(0.0, 0.4, 0.0), _choice(0.8, y_m=0.4), AHEAD)
-    assert np.allclose(future[:, 1], 0.0, atol=1e-9)
-
-
 def test_at_the_ways_end_it_stands_and_does_not_turn_about() -> None:
     short = AHEAD[:13]  # 1.2 m
     choice = _choice(0.8)
@@ -94,20 +77,7 @@ def test_at_the_ways_end_it_stands_and_does_not_turn_about() -> None:
     assert future[-1, 0] == pytest.approx(0.85, abs=0.1)
 
 
-def test_without_a_way_it_stands_where_its_plan_ends() -> None:
-    future = chosen_future(SE2(0.0, 0.0, 0.0), _choice(0.5), np.zeros((1, 2)))
-    assert np.allclose(future[40:], future[39])
-
-
 # -- what was driven --------------------------------------------------------------------------------------------------
-
-
-def test_driven_is_relative_to_the_frame_and_exact() -> None:
-    poses = arc(80)
-    future = driven_future(poses, 7, 79)
-    assert future.shape == (50, 3)
-    assert np.allclose(future, relative(poses[7], poses[8:58]))
-    assert driven_future(poses, 70, 75).shape == (5, 3)
 
 
 def _labels(by: np.ndarray, goes_on: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -130,11 +100,6 @@ def test_frames_whose_next_five_seconds_are_disturbed_take_what_was_chosen() -> 
     disturbed = [k for k in range(150) if np.array_equal(future[k], chosen[k])]
     assert disturbed == list(range(51, 110))
     assert np.allclose(future[50], relative(poses[50], poses[51:101]))
-
-
-def test_a_policys_drive_is_labelled_with_what_the_expert_chose() -> None:
-    future, steps, _, chosen = _labels(np.full(60, POLICY, np.uint8), goes_on=False)
-    assert np.array_equal(future, chosen) and np.all(steps == FUTURE_STEPS)
 
 
 def test_at_the_end_what_was_chosen_there_goes_on() -> None:

@@ -1,4 +1,4 @@
-"""Heads tell labels from the tokens of their own cell or column; a loss is a mean over pictures, shared out or not."""
+"""Heads predict labels from the tokens of their own cell or column; scores are full for correct predictions alone."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from tools.train.encoder.heads import WEIGHTS, Balance, EncoderHeads, as_tensors, losses, total
-from tools.train.encoder.labels import CLASSES, COLUMNS, FREE_M, LANDMARK, NONE, OCTANTS, OPENINGS, label_shapes
+from tools.train.encoder.heads import WEIGHTS, Balance, EncoderHeads, Fixed, Score, as_tensors, decide, losses, total
+from tools.train.encoder.labels import CLASSES, COLUMNS, FREE_M, LANDMARK, NONE, OCTANTS, OPENINGS, PERSON, label_shapes
 
 SIDE, DIM = 4, 16
 CELLS = ("main", "thing", "colour", "facing", "near_m", "thing_m")
@@ -65,14 +65,6 @@ def costs(heads: EncoderHeads, labels: Mapping[str, Any], seen: torch.Tensor) ->
     return losses(heads(seen), as_tensors(labels, "cpu"), Balance.of(some_labels(40)))
 
 
-def test_there_is_a_prediction_of_every_label_that_is_learned(heads: EncoderHeads) -> None:
-    found = heads(tokens())
-    assert set(found) == set(WEIGHTS) == set(label_shapes(SIDE)) - {"rank"}
-    for name, tensor in found.items():
-        _, shape = label_shapes(SIDE)[name]
-        assert tensor.shape[1 : 1 + len(shape)] == shape, name
-
-
 def test_a_cell_is_told_from_its_own_token_and_a_column_from_its_own_column(heads: EncoderHeads) -> None:
     before, row, column = tokens(1), 1, 2
     after = before.clone()
@@ -121,21 +113,75 @@ def test_rare_classes_count_more_and_all_together_count_as_one() -> None:
     assert np.isfinite(weights).all() and weights.max() <= 6.0
 
 
-def test_data_without_anything_rare_can_still_be_balanced() -> None:
-    labels = {name: np.zeros((3, *shape), kind) for name, (kind, shape) in label_shapes(SIDE).items()}
-    labels["colour"][:], labels["facing"][:] = NONE, NONE
-    balance = Balance.of(labels)
-    assert all(np.isfinite(weights).all() for weights in balance.classes.values())
-    assert all(share > 0 for share in balance.shares.values())
+WIDE = 8
+MACHINE = CLASSES.index("vending_machine")
 
 
-def test_a_seed_names_the_weights() -> None:
-    one, same, other = EncoderHeads(DIM, SIDE), EncoderHeads(DIM, SIDE), EncoderHeads(DIM, SIDE)
-    for made, seed in ((one, 1), (same, 1), (other, 2)):
-        made.initialise(torch.Generator().manual_seed(seed))
-    assert torch.equal(one.cells.weight, same.cells.weight) and not torch.equal(one.cells.weight, other.cells.weight)
+def scored(said: Any, labels: Any) -> dict[str, Any]:
+    score = Score()
+    score.add(said, labels)
+    return score.result()
 
 
-def test_columns_that_tokens_do_not_divide_are_refused() -> None:
-    with pytest.raises(ValueError, match="divides"):
-        EncoderHeads(DIM, 7)
+def right(labels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return decide(perfect(as_tensors(labels, "cpu")))
+
+
+def with_machine(column: int, count: int = 4) -> dict[str, np.ndarray]:
+    """Pictures of walls with a machine in one column."""
+    labels = some_labels(count, side=WIDE)
+    labels["thing"][:], labels["rank"][:] = CLASSES.index("wall"), 0
+    labels["thing"][:, 2:5, column], labels["rank"][:, 2:5, column] = MACHINE, LANDMARK
+    return labels
+
+
+def test_whoever_is_right_has_a_full_score() -> None:
+    labels = some_labels(30, side=WIDE)
+    found = scored(right(labels), labels)
+    for name in (
+        "main_accuracy", "landmark_recall", "colour_accuracy", "facing_within_octant", "place_accuracy",
+        "opening_recall", "opening_precision", "opening_kind_accuracy", "landmark_bearing",
+    ):  # fmt: skip
+        assert found[name] == 1.0, name
+    for name in ("near", "thing", "free", "open"):
+        assert found[f"{name}_relative_error"] < 1e-3
+        assert max(found[f"{name}_error_m"].values()) < 0.02
+    assert all(each["recall"] == each["precision"] == 1.0 for each in found["things"].values())
+    assert found["pictures"] == 30
+
+
+@pytest.mark.parametrize(("said", "found"), [(2, 1.0), (3, 0.0), (6, 0.0)])
+def test_a_landmark_is_found_where_it_stands_and_not_beside_it(said: int, found: float) -> None:
+    assert scored(right(with_machine(said)), with_machine(2))["landmark_bearing"] == found
+
+
+def test_missed_and_imagined_people_are_told_apart() -> None:
+    labels = with_machine(3)
+    labels["thing"][:, 6:, :2] = PERSON
+    said = right(labels)
+    said["thing"][:, 6, :2] = CLASSES.index("wall")
+    missed = scored(said, labels)
+    assert missed["person_recall"] == 0.5 and missed["person_precision"] == 1.0
+    said = right(labels)
+    said["thing"][:, 4:6, :2] = PERSON
+    imagined = scored(said, labels)
+    assert imagined["person_recall"] == 1.0 and imagined["person_precision"] == 0.5
+
+
+def test_distances_are_scored_by_how_far_away_things_are() -> None:
+    labels = some_labels(10, side=WIDE)
+    said = right(labels)
+    said["free_m"] = np.where(labels["free_m"] >= 8, labels["free_m"] - 2.0, labels["free_m"]).astype(np.float32)
+    found = scored(said, labels)["free_error_m"]
+    assert found["8+"] == pytest.approx(2.0, abs=0.02) and found["2-5"] < 0.01
+
+
+def test_the_fixed_answer_is_what_is_most_common_at_each_place() -> None:
+    labels = with_machine(5, count=9)
+    labels["free_m"][:] = 3.0
+    labels["free_m"][0] = 12.0
+    said = Fixed(labels).of(4)
+    assert (said["thing"][:, 2:5, 5] == MACHINE).all() and (said["thing"][:, 0] == CLASSES.index("wall")).all()
+    assert said["free_m"].shape == (4, 32) and (said["free_m"] == 3.0).all()
+    assert scored(said, {name: array[:4] for name, array in labels.items()})["landmark_bearing"] == 1.0
+    assert scored(said, with_machine(1))["landmark_bearing"] == 0.0

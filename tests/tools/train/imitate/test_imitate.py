@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
@@ -12,24 +11,25 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from edge.inference.latency_profile import LatencyProfile
 from export.model.config import TicVlaConfig
 from export.model.network import build
 from tests.support.train.train_drives import MadeUpTokens, tiny_model
-from tests.support.train.train_imitate_rank import CONFIG, FRAMES, SideStates, imitate_job, side_dataset, trained
+from tests.support.train.train_imitate_rank import CONFIG, FRAMES, imitate_job, side_dataset, trained
 from tests.support.train.train_stage_contract import Run, StageContract
+from tools.train.config.checks import OptimConfig, TrainError
 from tools.train.config.imitate import POINT_GOAL, ImitateConfig, ImitateEvalConfig, SampleConfig
-from tools.train.config.optim import OptimConfig
-from tools.train.config.recipe import load_recipe
 from tools.train.drives.drive import Dataset
-from tools.train.imitate.data import NoStates, SampleError
-from tools.train.imitate.imitate import POINT_GOAL_FILE, ImitateError, budget, fit, run
-from tools.train.imitate.point_goal_net import PointGoalFileError, build_point_goal, load_point_goal
-from tools.train.imitate.trainable_policies import ActionExpertPolicy, PointGoalNetPolicy
+from tools.train.imitate.data import NoStates
+from tools.train.imitate.imitate import POINT_GOAL_FILE, fit, run
+from tools.train.imitate.trainable_policies import (
+    PointGoalNetPolicy,
+    build_point_goal,
+    load_point_goal,
+)
 from tools.train.pipeline.chain import Step, run_step
-from tools.train.run import optim
+from tools.train.run import distributed
 from tools.train.run.job import StageJob
-from tools.train.run.network_file import finish_network, stage_weights
+from tools.train.run.network_file import stage_weights
 
 LONG = dataclasses.replace(
     CONFIG,
@@ -72,7 +72,6 @@ def test_it_learns_to_drive_by_what_it_is_told_in_places_it_has_not_seen(tmp_pat
     errors = result["held_out"]["all"]
     # The side is in the words alone: with the other drive's it goes the other way.
     assert errors["policy"]["fde_m"]["3s"] < 0.8 * errors["other_words"]["fde_m"]["3s"]
-    assert (job.run_dir.curves / "imitate_held_out.png").stat().st_size > 1000
 
 
 def test_all_of_the_action_expert_learns_and_nothing_else(whole: Run) -> None:
@@ -84,7 +83,6 @@ def test_all_of_the_action_expert_learns_and_nothing_else(whole: Run) -> None:
 
 class TestStage(StageContract):
     rank = "tests.support.train.train_imitate_rank"
-    error = ImitateError
     other = dataclasses.replace(CONFIG, inject_delay=False)
 
     @pytest.fixture(autouse=True)
@@ -124,7 +122,7 @@ VARIANTS: list[tuple[dict[str, Any], dict[str, Any]]] = [
 def test_every_variant_of_the_paper_can_be_trained(
     tmp_path: Path, dataset: Dataset, model: dict[str, Any], config: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(optim, "computes_bf16", lambda _device: True)  # slowly, where there are no instructions for it
+    monkeypatch.setattr(distributed, "computes_bf16", lambda _device: True)
     short = dataclasses.replace(CONFIG, samples=16, held_steps=2, evaluate=ImitateEvalConfig(samples=4, batch=4))
     job = imitate_job(tmp_path, dataclasses.replace(short, **config), with_action(**model))
     network, result = trained(dataset, job)
@@ -136,15 +134,6 @@ def test_every_variant_of_the_paper_can_be_trained(
 
 
 @pytest.mark.slow
-def test_a_devices_profile_says_under_which_ages_is_trained(tmp_path: Path, dataset: Dataset) -> None:
-    path = tmp_path / "orin.json"
-    path.write_text(json.dumps(LatencyProfile.constant(2.0).as_json()))
-    config = dataclasses.replace(CONFIG, delays=dataclasses.replace(CONFIG.delays, profile=str(path)), samples=8)
-    _, result = trained(dataset, imitate_job(tmp_path / "run", config))
-    assert result["mean_age_s"] == pytest.approx(3.0)
-
-
-@pytest.mark.slow
 def test_the_point_goal_baseline_learns_from_where_the_goal_is(tmp_path: Path, dataset: Dataset) -> None:
     config = dataclasses.replace(LONG, policy=POINT_GOAL)
     job = imitate_job(tmp_path, config)
@@ -153,17 +142,6 @@ def test_the_point_goal_baseline_learns_from_where_the_goal_is(tmp_path: Path, d
     result = fit(job, policy, dataset, MadeUpTokens(), states, of="test")
     assert result["mean_age_s"] == 0.0 and set(result["held_out"]["all"]) == {"policy", "keep_state"}
     assert result["held_loss"] < 0.5 * next(iter(job.run_dir.lines()))["loss"]
-
-
-def test_drives_without_states_cannot_be_learned_from(tmp_path: Path, dataset: Dataset) -> None:
-    class Nobody(SideStates):
-        def anchors(self, drive_id: str) -> tuple[int, ...]:
-            return ()
-
-    job = imitate_job(tmp_path)
-    policy = ActionExpertPolicy(build(tiny_model(), 1).action, CONFIG.loss)
-    with pytest.raises(SampleError, match="no frame"):
-        fit(job, policy, dataset, MadeUpTokens(), Nobody(dataset), of="test")
 
 
 @pytest.mark.slow
@@ -183,18 +161,6 @@ def test_the_stage_reads_the_runs_drives_and_goes_on_after_a_round_of_dagger(tmp
     assert 0 < (after[name] - before[name]).abs().max() < 4e-3
 
 
-@pytest.mark.slow
-def test_imitation_goes_on_with_the_language_model_that_has_gone_on(tmp_path: Path) -> None:
-    side_dataset(tmp_path / "collect")
-    config = dataclasses.replace(CONFIG, samples=16, evaluate=ImitateEvalConfig(samples=4, batch=4))
-    job = imitate_job(tmp_path, config)
-    run_step(job, Step("imitate"))
-    finish_network(job, "sft", build(tiny_model(), 77))
-    run_step(job, Step("imitate", 1))
-    spoken, after = (load(stage_weights(tmp_path, name)) for name in ("sft", "imitate"))
-    assert all(torch.equal(after[name], tensor) for name, tensor in spoken.items() if name.startswith("language."))
-
-
 def load(path: Path) -> dict[str, torch.Tensor]:
     return load_file(path)
 
@@ -210,28 +176,5 @@ def test_the_point_goal_stage_leaves_its_own_weights(tmp_path: Path) -> None:
     plans = network(torch.zeros(2, 4, 32), torch.zeros(2, 3), torch.tensor([[5.0, 0.0], [0.0, 0.0]]))
     assert plans.shape == (2, 30, 3) and torch.isfinite(plans).all()
     assert not stage_weights(tmp_path, "imitate").exists()
-    with pytest.raises(PointGoalFileError, match="another size"):
+    with pytest.raises(TrainError, match="another size"):
         load_point_goal(path, with_action(steps=10))
-
-
-def test_the_recipes_numbers_are_checked() -> None:
-    with pytest.raises(ValueError, match="multiple of"):
-        ImitateConfig(batch=6)
-    with pytest.raises(ValueError, match="point-goal"):
-        ImitateConfig(policy="rl")
-    with pytest.raises(ValueError, match="go_on_share"):
-        ImitateConfig(go_on_share=1.5)
-
-
-def test_a_shipped_recipe_can_be_changed_by_flags_and_tells_its_work() -> None:
-    recipe = load_recipe(
-        "nano",
-        [
-            "imitate.delays.profile=/a/b.json", "imitate.inject_delay=false", "imitate.sample.weights.turn=3",
-            "model.action.semantic_interface=waypoints",
-        ],
-    )  # fmt: skip
-    assert recipe.imitate is not None
-    assert recipe.imitate.delays.profile == "/a/b.json" and not recipe.imitate.inject_delay
-    assert recipe.imitate.sample.weights.turn == 3.0
-    assert ("samples learned", recipe.imitate.samples, "imitate") in budget(recipe)

@@ -13,32 +13,28 @@ import torch
 
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED
 from edge.inference.latency_profile import LatencyProfile
-from export.checkpoint.coverage import CheckpointError
-from export.checkpoint.shipped import shipped_weights
-from export.model.config import PRESETS
-from export.model.config_file import with_overrides
+from export.checkpoint.load import shipped_weights
+from export.model.config import PRESETS, with_overrides
 from export.model.network import build
-from export.model.weights import WeightsInfo, save_weights
+from export.model.weights import CheckpointError, WeightsInfo, save_weights
 from tools.train import cli
-from tools.train.collect.collection import CollectFailedError
+from tools.train.config.checks import TrainError
 from tools.train.config.collect import DaggerConfig
 from tools.train.config.recipe import Recipe, load_recipe
+from tools.train.imitate.data import Delays
 from tools.train.pipeline import chain
 from tools.train.pipeline.chain import Step, adopt, is_done, may_begin, run_step, steps_of, steps_until
-from tools.train.pipeline.model_card import CardError, card, ship, write_card
-from tools.train.rl.vector_env import RolloutFailedError
-from tools.train.run.exported import ExportError, export_artifacts, model_argument
-from tools.train.run.job import StageJob
+from tools.train.pipeline.model_card import card, ship, write_card
+from tools.train.run.job import StageFailedError, StageJob
 from tools.train.run.network_file import (
-    NetworkFileError,
+    ExportError,
+    export_artifacts,
     finish_network,
     import_start,
     read_network,
     start_network,
-    weights_before,
 )
-from tools.train.run.run_dir import RunDir, RunDirError
-from tools.train.samples.delays import Delays
+from tools.train.run.run_dir import RunDir
 
 TINY = load_recipe("tiny")
 SCORE = {
@@ -69,6 +65,12 @@ def stage_that(leaves: str) -> Callable[[str], Callable[[StageJob], dict[str, An
     return stage
 
 
+def use(monkeypatch: pytest.MonkeyPatch, stage: Callable[[str], Callable[[StageJob], dict[str, Any]]]) -> None:
+    """Replace all stages."""
+    for name in chain.RUNS:
+        monkeypatch.setitem(chain.RUNS, name, stage(name))
+
+
 # The chain
 
 
@@ -83,85 +85,45 @@ def test_all_goes_through_every_stage_with_imitation_again_after_each_round() ->
     assert [step.name for step in steps_of("sft", recipe)] == ["sft"]
 
 
-def test_a_step_is_done_once_its_result_is_there(run_dir: RunDir) -> None:
-    assert not is_done(run_dir, Step("sft"))
-    run_step(job(run_dir), Step("sft"), stage_that("weights"))
-    assert is_done(run_dir, Step("sft")) and run_dir.result("sft") == {"stage": "sft", "resumed": False}
-
-
 def test_a_stage_that_was_begun_is_neither_written_over_nor_forgotten(run_dir: RunDir) -> None:
     (run_dir.stage("sft") / "checkpoint").touch()
-    with pytest.raises(RunDirError, match="--resume"):
+    with pytest.raises(TrainError, match="--resume"):
         may_begin(run_dir, Step("sft"), resume=False)
     may_begin(run_dir, Step("sft"), resume=True)
 
 
-def test_imitation_after_a_round_begins_anew_and_keeps_what_was_before(run_dir: RunDir) -> None:
-    run_step(job(run_dir), Step("imitate"), stage_that("before"))
+def test_imitation_after_a_round_begins_anew_and_keeps_what_was_before(
+    run_dir: RunDir, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use(monkeypatch, stage_that("before"))
+    run_step(job(run_dir), Step("imitate"))
     again = Step("imitate", 1)
     assert is_done(run_dir, Step("imitate")) and not is_done(run_dir, again)
     may_begin(run_dir, again, resume=False)
-    run_step(job(run_dir, resume=True), again, stage_that("after"))
+    use(monkeypatch, stage_that("after"))
+    run_step(job(run_dir, resume=True), again)
     assert (run_dir.out / "imitate-0" / "before").exists() and (run_dir.out / "imitate" / "after").exists()
     assert run_dir.result("imitate") == {"stage": "imitate", "resumed": False}
     assert is_done(run_dir, Step("imitate")) and is_done(run_dir, again)
-
-
-def test_imitation_after_a_round_that_was_stopped_goes_on_where_it_was(run_dir: RunDir) -> None:
-    run_step(job(run_dir), Step("imitate"), stage_that("before"))
-    run_dir.retire("imitate", "imitate-0")
-    (run_dir.stage("imitate") / "checkpoint").touch()
-    again = Step("imitate", 1)
-    assert is_done(run_dir, Step("imitate")) and not is_done(run_dir, again)
-    run_step(job(run_dir, resume=True), again, stage_that("after"))
-    assert run_dir.result("imitate") == {"stage": "imitate", "resumed": True}
 
 
 def test_borrowed_drives_are_not_added_to(run_dir: RunDir, tmp_path: Path) -> None:
     other = RunDir.open(tmp_path / "other", TINY)
     run_dir.finish("collect", {})
     other.borrow(run_dir, ("collect",), TINY)
-    with pytest.raises(RunDirError, match=r"dagger.rounds=0"):
+    with pytest.raises(TrainError, match=r"dagger.rounds=0"):
         may_begin(other, Step("dagger", 1), resume=False)
 
 
 def test_a_round_needs_a_policy(run_dir: RunDir) -> None:
-    with pytest.raises(RunDirError, match="run imitate first"):
+    with pytest.raises(TrainError, match="run imitate first"):
         run_step(job(run_dir), Step("dagger", 1))
 
 
 # The network between stages
 
 
-def test_a_stage_begins_with_what_the_one_before_it_left(run_dir: RunDir) -> None:
-    first = start_network(job(run_dir), "encoder")
-    assert weights_before(run_dir.out, "sft") is None
-    with torch.no_grad():
-        next(first.language.parameters()).fill_(0.5)
-    finish_network(job(run_dir), "encoder", first)
-    second = start_network(job(run_dir), "sft")
-    assert all(torch.equal(a, b) for a, b in zip(first.parameters(), second.parameters(), strict=True))
-    assert weights_before(run_dir.out, "imitate") == run_dir.out / "encoder" / "model.safetensors"
-    assert run_dir.model_path.read_bytes() == (run_dir.out / "encoder" / "model.safetensors").read_bytes()
-
-
-def test_an_ablation_keeps_encoder_and_language_model_and_its_action_expert_is_of_the_seed(run_dir: RunDir) -> None:
-    path = finish_network(job(run_dir), "sft", build(TINY.model, 5))
-    other = with_overrides(TINY.model, {"action.layers": "2"})
-    model, seeded = read_network(path, other, 9), build(other, 9)
-    trained = build(TINY.model, 5)
-    assert all(torch.equal(a, b) for a, b in zip(model.vision.parameters(), trained.vision.parameters(), strict=True))
-    assert all(torch.equal(a, b) for a, b in zip(model.action.parameters(), seeded.action.parameters(), strict=True))
-
-
 DEAF = ("action.latency_aware", "action.motion_offset")
-
-
-@pytest.mark.parametrize("to", DEAF)
-def test_an_ablation_of_what_is_heard_begins_with_the_weights_of_the_whole(run_dir: RunDir, to: str) -> None:
-    path = finish_network(job(run_dir), "sft", build(TINY.model, 5))
-    model, trained = read_network(path, with_overrides(TINY.model, {to: "false"}), 9), build(TINY.model, 5)
-    assert all(torch.equal(a, b) for a, b in zip(model.action.parameters(), trained.action.parameters(), strict=True))
 
 
 @pytest.mark.parametrize("to", DEAF)
@@ -184,20 +146,11 @@ def test_an_ablation_of_another_shape_is_refused_as_a_beginning(run_dir: RunDir,
 
 def test_weights_of_another_language_model_are_refused(run_dir: RunDir) -> None:
     path = finish_network(job(run_dir), "sft", build(TINY.model, 5))
-    with pytest.raises(NetworkFileError, match="language differs from the recipe's"):
+    with pytest.raises(TrainError, match="language differs from the recipe's"):
         read_network(path, with_overrides(TINY.model, {"language.layers": "2"}), 9)
     path.write_bytes(b"nothing")
-    with pytest.raises(NetworkFileError, match="not weights of edge-train"):
+    with pytest.raises(TrainError, match="not weights of edge-train"):
         read_network(path, TINY.model, 9)
-
-
-def test_a_run_may_begin_with_weights_that_were_there(run_dir: RunDir, tmp_path: Path) -> None:
-    save_weights(build(TINY.model, 7), tmp_path / "w.safetensors", WeightsInfo(True, "elsewhere"))
-    import_start(run_dir.out, TINY.model, [tmp_path / "w.safetensors"], 1)
-    begun, theirs = start_network(job(run_dir), "encoder"), build(TINY.model, 7)
-    assert all(
-        torch.equal(a, b) for a, b in zip(begun.language.parameters(), theirs.language.parameters(), strict=True)
-    )
 
 
 NEWEST = replace(TINY, dagger=DaggerConfig(rounds=2, episodes=1, newest_only=True))
@@ -211,19 +164,13 @@ def adopted(run_dir: RunDir, tmp_path: Path, after: str) -> list[str]:
     return [step.name for step in steps_of("all", NEWEST) if not is_done(run_dir, step)]
 
 
-@pytest.mark.slow
-def test_a_run_goes_on_from_the_weights_that_imitation_left_elsewhere(run_dir: RunDir, tmp_path: Path) -> None:
-    left = adopted(run_dir, tmp_path, "imitate")
-    assert left == ["dagger-1", "sft-1", "imitate-1", "dagger-2", "imitate-2", "rl", "evaluate"]
-    policy = weights_before(run_dir.out, "rl")
-    assert policy == run_dir.out / "imitate" / "model.safetensors"
-    assert policy.read_bytes() == run_dir.model_path.read_bytes()
-
-
-def test_a_run_goes_on_from_the_weights_that_a_round_left_elsewhere(run_dir: RunDir, tmp_path: Path) -> None:
+def test_a_run_goes_on_from_the_weights_that_a_round_left_elsewhere(
+    run_dir: RunDir, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert adopted(run_dir, tmp_path, "imitate-1") == ["dagger-2", "imitate-2", "rl", "evaluate"]
     assert (run_dir.retired("sft"), run_dir.retired("imitate")) == (1, 1)
-    run_step(job(run_dir), Step("imitate", 2), stage_that("after"))
+    use(monkeypatch, stage_that("after"))
+    run_step(job(run_dir), Step("imitate", 2))
     assert (run_dir.out / "imitate-1" / "model.safetensors").exists() and run_dir.retired("imitate") == 2
 
 
@@ -232,7 +179,7 @@ def test_a_run_goes_on_from_the_weights_that_a_round_left_elsewhere(run_dir: Run
     [("sft", NEWEST, "expected one of imitate, imitate-1"), ("imitate", TINY, "set dagger.newest_only=true")],
 )
 def test_weights_are_adopted_only_where_all_that_follows_is_possible(after: str, recipe: Recipe, says: str) -> None:
-    with pytest.raises(RunDirError, match=says):
+    with pytest.raises(TrainError, match=says):
         steps_until(after, recipe, steps_of("all", recipe))
 
 
@@ -273,18 +220,13 @@ def test_an_export_that_fails_says_its_last_line(tmp_path: Path) -> None:
         export_artifacts(tmp_path / "w", PRESETS["nano"], tmp_path / "a", command=command(tmp_path, 130))
 
 
-def test_a_network_without_a_name_is_exported_by_its_numbers(tmp_path: Path) -> None:
-    written = Path(model_argument(TINY.model, tmp_path / "artifacts"))
-    assert json.loads(written.read_text())["action"]["layers"] == TINY.model.action.layers
-
-
 # The command
 
 
 @pytest.fixture
 def stages(monkeypatch: pytest.MonkeyPatch) -> None:
     """Stages that do nothing but leave a file."""
-    monkeypatch.setattr(chain, "module_run", stage_that("file"))
+    use(monkeypatch, stage_that("file"))
 
 
 def run(*arguments: object) -> int:
@@ -333,27 +275,11 @@ def test_what_makes_no_sense_is_one_line(
     assert says in told and told.count("\n") == 1 and not list(tmp_path.iterdir())
 
 
-def test_reinforcement_learning_needs_no_drives_before_it() -> None:
-    assert steps_until("imitate", TINY, steps_of("rl", TINY))[-1] == Step("imitate")
-    with pytest.raises(RunDirError, match="newest_only"):
-        steps_until("imitate", TINY, steps_of("dagger", TINY))
-
-
-def test_a_devices_delays_are_those_of_every_stage_that_injects_any(tmp_path: Path) -> None:
-    profile = tmp_path / "orin.json"
-    profile.write_text(json.dumps(LatencyProfile.constant(2.0).as_json()))
-    out = tmp_path / "out"
-    recipe = cli._recipe(cli.parser().parse_args(["all", "--out", str(out), "--delay-profile", str(profile)]))
-    assert recipe.imitate is not None and recipe.rl is not None
-    assert recipe.imitate.delays.profile == recipe.rl.delay_profile
-    assert Path(recipe.rl.delay_profile).parent == out
-
-
 def test_a_run_keeps_its_own_copy_of_a_devices_delays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
     profile, out = tmp_path / "orin.json", tmp_path / "out"
-    monkeypatch.setattr(chain, "module_run", stage_that("weights"))
+    use(monkeypatch, stage_that("weights"))
     asked = ("imitate", "--preset", "tiny", "--out", out, "--delay-profile", profile)
     profile.write_text(json.dumps(LatencyProfile.constant(2.0).as_json()))
     assert run(*asked) == EXIT_DONE
@@ -379,22 +305,22 @@ def raising(error: BaseException) -> Callable[[str], Callable[[StageJob], dict[s
     [
         (KeyboardInterrupt(), EXIT_INTERRUPTED),
         (ExportError("a gate failed"), EXIT_CHECK_FAILED),
-        (CollectFailedError("its process ended"), EXIT_CHECK_FAILED),
-        (RolloutFailedError("its process ended"), EXIT_CHECK_FAILED),
-        (RunDirError("no such drive"), EXIT_BAD_INPUT),
+        (StageFailedError("its process ended"), EXIT_CHECK_FAILED),
+        (StageFailedError("its process ended"), EXIT_CHECK_FAILED),
+        (TrainError("no such drive"), EXIT_BAD_INPUT),
         (OSError("the disk is full"), EXIT_BAD_INPUT),
     ],
 )
 def test_a_stage_that_cannot_go_on_ends_with_its_code_and_a_line(
     error: BaseException, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
-    monkeypatch.setattr(chain, "module_run", raising(error))
+    use(monkeypatch, raising(error))
     assert run("sft", "--preset", "tiny", "--out", tmp_path / "run") == code
     assert "Traceback" not in capsys.readouterr().err and RunDir(tmp_path / "run").result("sft") is None
 
 
 def test_a_bug_is_not_dressed_up_as_bad_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(chain, "module_run", raising(ValueError("shapes do not match")))
+    use(monkeypatch, raising(ValueError("shapes do not match")))
     with pytest.raises(ValueError, match="shapes"):
         run("sft", "--preset", "tiny", "--out", tmp_path / "run")
 
@@ -438,14 +364,9 @@ def test_the_card_says_what_it_is_made_of_and_how_well_it_does(trained: RunDir, 
     assert card(trained, TINY, trained.model_path) == card(trained, TINY, trained.model_path)
 
 
-def test_without_weights_there_is_no_card(run_dir: RunDir) -> None:
-    with pytest.raises(CardError, match="train first"):
-        write_card(run_dir, TINY)
-
-
 def test_scores_of_something_else_are_refused(trained: RunDir, tmp_path: Path) -> None:
     (tmp_path / "other.json").write_text("{}")
-    with pytest.raises(CardError, match=r"result.json of edge-bench"):
+    with pytest.raises(TrainError, match=r"result.json of edge-bench"):
         write_card(trained, TINY, [tmp_path / "other.json"])
 
 
@@ -459,49 +380,6 @@ def test_weights_that_are_given_away_are_half_the_size_and_the_default_of_their_
     assert shipped_weights(TINY.model, tmp_path / "nothing") is None
 
 
-def test_what_is_given_away_has_every_number_beside_it(trained: RunDir, tmp_path: Path) -> None:
-    path = ship(trained, TINY, tmp_path / "weights")
-    assert load_recipe(str(path.with_suffix(".recipe.toml"))) == TINY
-
-
-def test_the_card_of_an_ablation_says_that_it_is_one_of_another_run(trained: RunDir, tmp_path: Path) -> None:
-    ablation = RunDir.open(tmp_path / "ablation", TINY)
-    trained.finish("collect", {})
-    ablation.borrow(trained, ("collect",), TINY)
-    assert "--recipe recipe.toml --from RUN`" in card(ablation, TINY, trained.model_path)
-    assert "--from" not in card(trained, TINY, trained.model_path)
-
-
-@pytest.mark.slow
-def test_a_card_tells_what_its_weights_went_on_from(trained: RunDir, tmp_path: Path) -> None:
-    first = ship(trained, TINY, tmp_path / "weights")
-    for number, after in enumerate(("imitate", "imitate-1")):
-        run_dir = RunDir.open(tmp_path / f"more{number}", NEWEST)
-        import_start(run_dir.out, TINY.model, [first], 1)
-        adopt(run_dir, steps_until(after, NEWEST, steps_of("all", NEWEST)))
-        run_dir.finish("rl", {"iterations": 20 + number})
-        text = card(run_dir, NEWEST, run_dir.model_path)
-        first = ship(run_dir, NEWEST, tmp_path / f"weights{number}")
-    assert "--checkpoint WEIGHTS --after imitate-1`" in text and "adopted" not in text
-    assert text.count("ab12") == 1 and "No weights of anybody else are in it." in text
-    parts = (
-        "* iterations: 21",
-        "## What it went on from",
-        "* iterations: 20",
-        "### What it went on from",
-        "* loss: 0.25",
-    )
-    assert [text.index(part) for part in parts] == sorted(text.index(part) for part in parts)
-
-
-def test_a_runs_own_card_is_found_beside_its_weights(trained: RunDir, tmp_path: Path) -> None:
-    write_card(trained, TINY)
-    more = RunDir.open(tmp_path / "more", TINY)
-    import_start(more.out, TINY.model, [trained.model_path], 1)
-    text = card(more, TINY, more.out / "start" / "model.safetensors")
-    assert "## What it went on from" in text and "ab12" in text and "recipe.toml --checkpoint WEIGHTS`" in text
-
-
 @pytest.mark.parametrize("text", [None, b"# Somebody's weights", b"\xff\xfe"])
 def test_weights_without_a_card_of_their_own_are_those_of_others(
     run_dir: RunDir, tmp_path: Path, text: bytes | None
@@ -512,10 +390,6 @@ def test_weights_without_a_card_of_their_own_are_those_of_others(
     assert "weights of others" in card(run_dir, NEWEST, run_dir.model_path)
 
 
-def test_weights_of_others_stay_those_of_others(run_dir: RunDir, tmp_path: Path) -> None:
-    adopted(run_dir, tmp_path, "imitate")
-    run_dir.finish("imitate", {"loss": 0.5})
-    more = RunDir.open(tmp_path / "more", NEWEST)
-    import_start(more.out, TINY.model, [ship(run_dir, NEWEST, tmp_path / "weights")], 1)
-    text = card(more, NEWEST, more.out / "start" / "model.safetensors")
-    assert "weights of others" in text and "No weights of anybody else" not in text
+def test_without_weights_there_is_no_card(run_dir: RunDir) -> None:
+    with pytest.raises(TrainError, match="train first"):
+        write_card(run_dir, TINY)

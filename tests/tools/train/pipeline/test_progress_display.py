@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from io import StringIO
 from pathlib import Path
-from typing import Any
 
 import pytest
-from rich.console import Console
 
 from tools.train.config.recipe import load_recipe
-from tools.train.pipeline.budget import Line, budget_of, lines_of
-from tools.train.pipeline.chain import steps_of
-from tools.train.run.curves import draw_curves, panels_of, smoothed
-from tools.train.run.job import PlainProgress
-from tools.train.run.progress_display import StageBar
+from tools.train.pipeline.chain import Line, budget_of, lines_of, steps_of
+from tools.train.run.curves import draw_curves
+from tools.train.run.job import progress_for
 from tools.train.run.run_dir import RunDir
 
 TINY = load_recipe("tiny")
@@ -36,14 +31,6 @@ def test_curves_are_drawn_of_every_stage_that_has_more_than_a_point(run_dir: Run
     assert (run_dir.curves / "sft.png").read_bytes() == first
 
 
-def test_numbers_of_a_kind_share_an_axis() -> None:
-    assert panels_of(["loss", "lr", "val_loss", "success"]) == [["loss", "val_loss"], ["success"], ["lr"]]
-
-
-def test_a_jagged_line_is_averaged_over_what_came_before() -> None:
-    assert smoothed([4.0, 2.0]) == [4.0, 3.0] and smoothed([1.0] * 100)[-1] == 1.0
-
-
 def test_the_budget_adds_up_what_was_measured_and_names_what_was_not() -> None:
     steps = steps_of("all", TINY)
     told = lines_of(TINY, steps, [Line("sft", "anchors", 5400, 54.0), Line("rl", "steps", 9, None)], "cpu")
@@ -51,20 +38,9 @@ def test_the_budget_adds_up_what_was_measured_and_names_what_was_not() -> None:
     assert {line.step for line in budget_of(TINY, steps, "cpu")} >= {"dagger-1", "evaluate"}
 
 
-def test_progress_elsewhere_than_on_a_terminal_is_a_line_now_and_then(capsys: Any) -> None:
-    progress = PlainProgress("sft", period_s=1e9)
-    for done in (1, 2, 3, 4, 4, 4):
-        progress.update(done, 4, loss=0.5)
-    progress.update(1, 9)
-    assert capsys.readouterr().err.count("\n") == 1
-    progress.update(9, 9)
-    assert "9 of 9" in capsys.readouterr().err
-
-
-def test_on_a_terminal_one_bar_shows_one_thing_after_another() -> None:
-    shown = StringIO()
-    with StageBar("sft", Console(file=shown, force_terminal=True, width=120)) as bar:
-        bar.update(1, 4, loss=0.5)
-        bar.say("looking")
-        bar.update(9, 9)
-    assert "looking" in shown.getvalue() and "9/9" in shown.getvalue()
+def test_progress_is_lines_with_the_newest_values(capsys: pytest.CaptureFixture[str]) -> None:
+    with progress_for("sft") as progress, progress_for("sft", quiet=True) as quiet:
+        progress.update(4, 4, loss=0.51234)
+        quiet.update(4, 4, loss=0.51234)
+    line = capsys.readouterr().err
+    assert line.startswith("edge-train: sft: 4 of 4 (") and line.endswith("), loss 0.5123\n")

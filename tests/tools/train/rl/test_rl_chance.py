@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -20,10 +19,10 @@ from edge.state.semantic import SemanticState
 from sim_hil.benchmark.policies.select import robot_config
 from sim_hil.scene.scene import load_scene
 from tests.support.benchmark.benchmark_episodes import corridor_episode
+from tools.train.drives.scenarios import FIRST_SEED
 from tools.train.rl import worker as rl_worker
-from tools.train.rl.rollout import EpisodeEnd, EpisodeSteps, PolicyOutput
-from tools.train.rl.vector_env import split
-from tools.train.rl.virtual_time_reasoner import START_NS, RolloutReasoner
+from tools.train.rl.policies import START_NS, TailPolicy
+from tools.train.rl.rollout import PolicyOutput
 from tools.train.rl.worker import (
     CONTROL_S,
     CommandLimiter,
@@ -32,8 +31,8 @@ from tools.train.rl.worker import (
     delays,
     drive_episode,
     scenarios,
+    split,
 )
-from tools.train.scenes.scenarios import FIRST_SEED
 
 TIMES = LatencyProfile("some", "drawn", (1.0, 2.0, 3.0))
 ORDER = RolloutOrder("", "", {}, 0, "", "out", 9003, (0, 1, 0, 1, 0), {}, TIMES, True, "none", 10.0, 7)
@@ -71,21 +70,10 @@ def _replaced(made: Any, **changes: Any) -> Any:
 # Random numbers
 
 
-def test_parts_of_an_order_keep_their_position() -> None:
-    parts = split(ORDER, 2)
-    assert [(part.first, part.numbers) for part in parts] == [(0, (0, 1)), (2, (0, 1)), (4, (0,))]
-    assert [Path(part.out).stem for part in parts] == ["000", "001", "002"]
-
-
 def test_a_repeated_task_has_another_crowd(drawn: list[tuple[int, int]]) -> None:
     seeds = [scenario.episode.seed for _, scenario in scenarios(ORDER)]
     assert len(set(seeds)) == len(ORDER.numbers) and min(seeds) >= FIRST_SEED
     assert seeds == [scenario.episode.seed for _, scenario in scenarios(ORDER)]
-
-
-def test_a_repeated_task_has_other_latencies(drawn: list[tuple[int, int]]) -> None:
-    times = [[delays(SOME, scenario, place).draw().total_ns for _ in range(20)] for place, scenario in scenarios(SOME)]
-    assert times[1] != times[3]
 
 
 def test_how_an_order_is_split_changes_nothing(drawn: list[tuple[int, int]]) -> None:
@@ -98,35 +86,8 @@ def test_how_an_order_is_split_changes_nothing(drawn: list[tuple[int, int]]) -> 
     assert drawn_for(ORDER) == [each for part in split(ORDER, 2) for each in drawn_for(part)]
 
 
-def test_exploration_noise_depends_on_the_position(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    explored: list[float] = []
-
-    def drive(*given: Any) -> tuple[EpisodeSteps, EpisodeEnd]:
-        explored.append(float(given[-1].uniform()))
-        return EpisodeSteps(), EpisodeEnd("e", "office", 0, 0, "stuck", False, False, False, 0.0, 0.0, 1.0)
-
-    monkeypatch.setattr(rl_worker, "drive_episode", drive)
-    monkeypatch.setattr(rl_worker, "scenarios", lambda order: enumerate([_Task(0)] * len(order.numbers), order.first))
-    monkeypatch.setattr(rl_worker, "config_from_dict", lambda content: None)
-    monkeypatch.setattr(rl_worker, "read_network", lambda *_: SimpleNamespace(eval=lambda: _Network()))
-    monkeypatch.setattr(rl_worker.checkpoint, "load", lambda path: ({}, {"log_std": (-2.0, -2.0)}))
-    monkeypatch.setattr(rl_worker, "_point_goal_policies", lambda *_: lambda scenario, place: None)
-    for part in split(replace(ORDER, out=str(tmp_path)), 2):
-        list(rl_worker.messages(part.to_json()))
-    assert len(set(explored)) == len(ORDER.numbers)
-
-
 class _Network:
     config = SimpleNamespace(vision=SimpleNamespace(image_px=32))
-
-
-def test_without_exploration_the_crowd_is_the_scenarios_own(drawn: list[tuple[int, int]]) -> None:
-    found = [scenario.episode.seed for _, scenario in scenarios(replace(SOME, explore=False))]
-    assert found == [FIRST_SEED + number for number in SOME.numbers]
-
-
-def test_consecutive_scenarios_are_generated_together_and_once(drawn: list[tuple[int, int]]) -> None:
-    assert len(list(scenarios(SOME))) == 4 and drawn == [(3, 3)]
 
 
 # Time and age
@@ -164,31 +125,32 @@ def test_a_policy_receives_the_time_to_the_nanosecond() -> None:
     assert [round(time_s * 1e9) for time_s in policy.times] == [k * 100_000_000 for k in range(13)]
 
 
-def _reasoner(age_s: float) -> RolloutReasoner:
-    """A reasoner at time 0 whose semantic state has that age."""
+def _policy(age_s: float) -> TailPolicy:
+    """A policy at time 0 whose semantic state has that age."""
     runtime = SimpleNamespace(frame_offsets_s=(9.0, 0.0), max_new_tokens=4)
     models: Any = SimpleNamespace(
         ages=SemanticConfig(), artifacts=SimpleNamespace(runtime=runtime), language=None,
         policy=SimpleNamespace(tokens_shape=(1, 2, 3)),
     )  # fmt: skip
-    reasoner = RolloutReasoner(models, "go", lambda: None)  # type: ignore[arg-type, return-value]
+    policy = TailPolicy(models, None, None, "go", lambda: None)  # type: ignore[arg-type, return-value]
     anchor_ns = START_NS - round(age_s * 1e9)
-    reasoner._slot.state = SemanticState(
-        1, anchor_ns, SE2(0, 0, 0), anchor_ns, np.zeros((1, 1, 2), np.float32), {}, "", None
-    )
-    return reasoner
+    kv = np.zeros((1, 1, 2), np.float32)
+    policy.slot.state = SemanticState(1, anchor_ns, SE2(0, 0, 0), anchor_ns, kv, {}, "", None)
+    return policy
 
 
 @pytest.mark.parametrize(("age_s", "given_s"), [(4.0, 4.0), (10.0, 10.0), (13.0, 10.0)])
 def test_delay_is_clipped_as_in_the_runner(age_s: float, given_s: float) -> None:
-    assert _reasoner(age_s).metadata(0.0, SE2(0, 0, 0))[0] == given_s
+    policy = _policy(age_s)
+    assert policy.slot.state is not None
+    assert policy.latency(policy.slot.state, 0.0, SE2(0, 0, 0))[0] == given_s
 
 
 @pytest.mark.parametrize(
     ("age_s", "share"), [(4.0, 1.0), (10.0, 1.0), (12.5, 0.5), (14.0, 0.2), (15.0, 0.0), (20.0, 0.0)]
 )
 def test_a_semantic_state_that_is_too_old_slows_the_robot_down_and_stops_it(age_s: float, share: float) -> None:
-    assert _reasoner(age_s).speed_scale(0.0) == pytest.approx(share)
+    assert _policy(age_s).speed_scale(0.0) == pytest.approx(share)
 
 
 @pytest.mark.parametrize("share", [1.0, 0.5, 0.2])

@@ -7,20 +7,19 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import pytest
 import torch
 
 from edge.inference.latency_profile import LatencyProfile
 from export.model.network import TicVla
-from export.model.weights import WeightsInfo, save_weights
 from tests.tools.train.rl.test_rl_tail import LIMITS, tiny_config, tiny_episode, tiny_network
+from tools.train.config.checks import TrainError
 from tools.train.config.recipe import Recipe
 from tools.train.config.rl import PpoConfig, RlConfig
 from tools.train.rl import rollout
 from tools.train.rl.ppo import TailLearner
-from tools.train.rl.rl import STAGE, RlError, Score, State, improve, run
+from tools.train.rl.rl import STAGE, Score, improve, run
 from tools.train.rl.worker import RolloutOrder
 from tools.train.run.job import StageJob, StopFlag
 from tools.train.run.network_file import finish_network
@@ -130,27 +129,6 @@ def test_a_policy_that_gets_worse_is_taken_back(tmp_path: Path) -> None:
     assert last["fell_back"] == 1.0
 
 
-def test_a_reset_policy_has_a_new_optimiser(tmp_path: Path) -> None:
-    job = _job(tmp_path, RlConfig(ppo=PPO))
-    state = State(job, TailLearner(tiny_network(), LIMITS, (-1.0, -1.0)), RlConfig(ppo=PPO, fall_back=0.1))
-    state.best = Score(0.8, 0.1, 0.5)
-    state.begin()
-    before = state.optimiser
-    assert not state.judge(Score(0.72, 0.1, 0.5)) and state.optimiser is before
-    assert state.judge(Score(0.6, 0.1, 0.5)) and state.optimiser is not before
-
-
-def test_a_gain_below_the_margin_is_ignored(tmp_path: Path) -> None:
-    config = RlConfig(ppo=PPO, keep_margin=0.06)
-    state = State(_job(tmp_path, config), TailLearner(tiny_network(), LIMITS, (-1.0, -1.0)), config)
-    state.best = Score(0.5, 0.2, 0.4)
-    state.begin()
-    state.judge(Score(0.55, 0.0, 0.5))
-    assert not state.improved and state.best.success == 0.5
-    state.judge(Score(0.57, 0.2, 0.5))
-    assert state.improved and state.best.success == 0.57
-
-
 def test_success_counts_first_and_collisions_where_it_is_no_less() -> None:
     some = Score(0.5, 0.2, 0.4)
     assert Score(0.6, 0.9, 0.4).ahead_of(some) and not Score(0.4, 0.0, 0.4).ahead_of(some)
@@ -193,7 +171,7 @@ def test_a_checkpoint_of_other_numbers_is_not_gone_on_from(tmp_path: Path) -> No
     _improved(tmp_path, config, _driver(tiny_network(), lambda _: True))
     other = RlConfig(iterations=2, evaluate_every=2, warmup_iterations=0, ppo=PPO, reward_scale=0.5)
     job = StageJob(Recipe("test", 0, tiny_config(), rl=other), RunDir(tmp_path), resume=True, seed=7)
-    with pytest.raises(RlError, match="another recipe"):
+    with pytest.raises(TrainError, match="another recipe"):
         improve(
             job,
             TailLearner(tiny_network(), LIMITS, other.log_std),
@@ -218,48 +196,13 @@ def test_a_devices_delays_reach_the_workers_with_their_late_frames(tmp_path: Pat
     assert received and set(received) == {profile}
 
 
-def test_progress_is_shown_after_every_episode(tmp_path: Path) -> None:
-    config = RlConfig(iterations=1, episodes=4, evaluate_episodes=2, warmup_iterations=0, ppo=PPO)
-    driver = _driver(tiny_network(), lambda _: True)
-    progress = Mock()
-
-    def drive(order: RolloutOrder, *, finished: Callable[[bool], None], **others: Any) -> rollout.Rollout:
-        for _ in order.numbers:
-            finished(True)
-        return driver(order, **others)
-
-    job = replace(_job(tmp_path, config), progress=progress)
-    learner = TailLearner(tiny_network(), LIMITS, config.log_std)
-    improve(job, learner, _imitated(job), tmp_path / "artifacts", drive)
-    updates = [call.args for call in progress.update.call_args_list]
-    assert [(done, of) for done, of in updates if of == 4] == [(1, 4), (2, 4), (3, 4), (4, 4)]
-
-
 def test_without_a_policy_there_is_nothing_to_improve(tmp_path: Path) -> None:
-    with pytest.raises(RlError, match="run imitate first"):
+    with pytest.raises(TrainError, match="run imitate first"):
         run(_job(tmp_path, RlConfig()))
 
 
 def test_an_untrained_action_expert_is_refused(tmp_path: Path) -> None:
     job = _job(tmp_path, RlConfig())
     finish_network(job, "sft", tiny_network())
-    with pytest.raises(RlError, match=r"sft/model.safetensors: the action expert is untrained"):
+    with pytest.raises(TrainError, match=r"sft/model.safetensors: the action expert is untrained"):
         run(job)
-
-
-def test_start_weights_with_an_untrained_action_expert_are_refused(tmp_path: Path) -> None:
-    job = _job(tmp_path, RlConfig())
-    save_weights(tiny_network(), tmp_path / "start" / "model.safetensors", WeightsInfo(False, "a backbone alone"))
-    with pytest.raises(RlError, match="is untrained"):
-        run(job)
-
-
-def test_kinds_of_scenes_take_turns() -> None:
-    config = RlConfig(rotate_every=2, rotation=("office", "hospital"))
-    assert [next(iter(config.kinds(i))) for i in range(5)] == ["office", "office", "hospital", "hospital", "office"]
-    assert set(RlConfig(rotate_every=0).kinds(3)) == {"office", "hospital", "warehouse"}
-
-
-def test_delays_have_the_mean_that_was_asked_for() -> None:
-    times = RlConfig(mean_delay_s=5.0).delays().generation_s
-    assert sum(times) / len(times) == pytest.approx(5.0) and (min(times), max(times)) == (0.0, 10.0)

@@ -15,7 +15,7 @@ from export.model.network import build
 from tests.support.train.train_drives import tiny_model
 from tools.train.config.imitate import LossConfig
 from tools.train.imitate.trainable_policies import ActionExpertPolicy
-from tools.train.samples.action_batch import Group, collate, plan, smooth_l1, trunk
+from tools.train.samples.action_batch import Group, collate, plan, smooth_l1
 
 CPU = torch.device("cpu")
 LENGTHS = (5, 9, 1)
@@ -123,19 +123,6 @@ def test_a_dropped_token_is_one_without_content_and_a_dropped_state_is_not_seen(
     assert not torch.allclose(plans[0], others[0], atol=1e-4)
 
 
-def test_padding_has_no_effect_and_no_gradient() -> None:
-    config = model_with()
-    action = expert(config)
-    batch = collate([group(0, 3, config), group(1, 8, config)], CPU)
-    guidance = batch.guidance.clone()
-    guidance[0, :5] = 50.0
-    spoiled = dataclasses.replace(batch, guidance=guidance.requires_grad_())
-    plans = plan(action, spoiled)
-    torch.testing.assert_close(plans, plan(action, batch), atol=1e-6, rtol=1e-6)
-    plans.square().sum().backward()
-    assert guidance.grad is not None and not guidance.grad[0, :5].any() and guidance.grad[0, 5:].any()
-
-
 def test_the_loss_is_smooth_l1_over_the_known_steps() -> None:
     config = model_with()
     one = group(2, 4, config)
@@ -169,21 +156,3 @@ def test_what_every_head_makes_small_is_about_its_own_frame(head: str) -> None:
     first.sum().backward()
     learned = [name for name, each in action.named_parameters() if each.grad is not None and each.grad.any()]
     assert {"semantic_projection.0.weight", "visual_position", "latency_projection.2.bias"} <= set(learned)
-
-
-def test_bfloat16_plans_are_the_same_but_for_its_rounding() -> None:
-    config = model_with()
-    action = expert(config)
-    batch = collate([group(0, 5, config)], CPU)
-    with torch.no_grad():
-        exact = plan(action, batch)
-        with torch.autocast("cpu", dtype=torch.bfloat16):
-            rough = plan(action, batch)
-    assert rough.dtype == torch.float32
-    assert 0 < (rough - exact).abs().max() < 0.05 * exact.abs().max()
-
-
-def test_a_network_that_would_drop_out_by_itself_is_refused() -> None:
-    config = model_with()
-    with pytest.raises(ValueError, match="evaluation mode"):
-        trunk(expert(config).train(), collate([group(0, 3, config)], CPU))

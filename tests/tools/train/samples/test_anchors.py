@@ -23,6 +23,7 @@ from sim_hil.benchmark.conditions.latency import Timing
 from sim_hil.benchmark.policies.lockstep_reasoner import VirtualTimeReasoner
 from tests.support.train.train_drives import WORDINGS, made_up_drive, progress_at, trace_at
 from tools.train.config.sft import DrawConfig
+from tools.train.drives.trace_sentences import aspects_of_json
 from tools.train.samples.anchors import (
     WAYPOINTS_START,
     Anchor,
@@ -35,7 +36,6 @@ from tools.train.samples.anchors import (
     too_far,
     waiting,
 )
-from tools.train.scenes.trace_sentences import aspects_of_json
 
 NANO = PRESETS["nano"]
 PERIOD_NS = 100_000_000
@@ -171,15 +171,6 @@ def test_wrong_words_are_as_rare_as_told_and_always_wrong(anchors: dict[int, Anc
     assert {each.wording for each in drawn} == set(WORDINGS)
 
 
-def test_some_generations_have_taken_long(anchors: dict[int, Anchor]) -> None:
-    config = DrawConfig(before_max_s=1.0, before_late=0.3, before_latest_s=5.0, before_wrong=0.0)
-    rng = np.random.default_rng(0)
-    drawn = [draw(anchors[100], config, rng).before for _ in range(500)]
-    soon = {anchors[100].before(1.0)}
-    late = {anchors[100].before(float(age)) for age in range(2, 6)} - soon
-    assert np.mean([each in late for each in drawn]) == pytest.approx(0.3, abs=0.1)
-
-
 def test_the_way_is_told_as_another_odometry_would(anchors: dict[int, Anchor]) -> None:
     config, rng = DrawConfig(way_point_m=0.0), np.random.default_rng(0)
     recorded = np.array(anchors[100].way)
@@ -199,12 +190,6 @@ def test_a_robot_that_waits_has_said_it_before_and_sees_one_place(anchors: dict[
         waiting(anchors[10], 1)
 
 
-def test_anchors_decide_near_which_the_progress_changes(anchors: dict[int, Anchor]) -> None:
-    for anchor in anchors.values():
-        near = [other.progress for other in anchors.values() if abs(other.k - anchor.k) <= 30]
-        assert anchor.decides == (near[0] != near[-1])
-
-
 def test_anchors_decide_where_the_robot_has_to_turn_back() -> None:
     traces = tuple(
         {"k": k, **trace_at(k), "plan": "turn back" if k == 20 else trace_at(k)["plan"]} for k in (0, 10, 20)
@@ -219,18 +204,8 @@ def test_confused_progress_is_never_the_right_one(progress: Progress) -> None:
     assert progress not in confused(progress)
 
 
-def test_draws_follow_from_the_seed(anchors: dict[int, Anchor]) -> None:
-    first, again = (np.random.default_rng(7) for _ in range(2))
-    config = DrawConfig()
-    assert [draw(a, config, first) for a in anchors.values()] == [draw(a, config, again) for a in anchors.values()]
-
-
 def test_an_answer_that_does_not_fit_the_context_is_refused(anchors: dict[int, Anchor]) -> None:
     language = dataclasses.replace(NANO.language, max_context=120)
     narrow = Prompts(tokenizer(), dataclasses.replace(NANO, language=language))
     with pytest.raises(ValueError, match="exceed the model's context of 120"):
         narrow.of(anchors[90], Drawn(WORDINGS[0], None))
-
-
-def test_a_drive_without_traces_has_no_anchors() -> None:
-    assert anchors_of(made_up_drive("b", traces=())) == []

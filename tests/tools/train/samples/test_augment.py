@@ -1,12 +1,17 @@
-"""Training pictures look different each time and show the same: nothing is moved, turned or mirrored."""
+"""Augmented images and samples show the same content: nothing is moved, and the text stays true."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
+from edge.core.geometry import SE2
+from edge.state.reasoning_text import format_text, parse_waypoints
+from tests.support.train.train_drives import drive
 from tools.train.config.encoder import AugmentConfig
-from tools.train.samples.augment import augmented, decoded, encoded, through_jpeg
+from tools.train.config.sft import AROUND, ShowConfig
+from tools.train.samples.anchors import Anchor, anchors_of, waiting
+from tools.train.samples.augment import augmented, decoded, disturbed, encoded, shifted, through_jpeg
 
 STILL = AugmentConfig(brightness=0.0, contrast=0.0, colour=0.0, blur_share=0.0, noise_share=0.0, jpeg_share=0.0)
 
@@ -29,25 +34,12 @@ def test_the_same_numbers_give_the_same_picture_and_others_another() -> None:
     assert np.array_equal(one, same) and not np.array_equal(one, other)
 
 
-def test_the_picture_that_is_given_is_not_touched() -> None:
-    given = picture()
-    for seed in range(10):
-        augmented(given, AugmentConfig(), np.random.default_rng(seed))
-    assert np.array_equal(given, picture())
-
-
 def test_left_stays_left_and_things_stay_where_they_are() -> None:
     for seed in range(40):
         seen = augmented(picture(), AugmentConfig(), np.random.default_rng(seed)).astype(float)
         assert seen[60:90, :40].mean() < seen[60:90, 88:].mean()
         red = seen[..., 0] - seen[..., 1]
         assert red[25:45, 25:45].mean() > 60 and red[60:, 60:].mean() < 30
-
-
-def test_it_is_brighter_and_darker_by_no_more_than_is_allowed() -> None:
-    config = AugmentConfig(brightness=0.2, contrast=0.0, colour=0.0, blur_share=0.0, noise_share=0.0, jpeg_share=0.0)
-    shares = [augmented(picture(), config, np.random.default_rng(seed)).mean() / picture().mean() for seed in range(60)]
-    assert 0.79 < min(shares) < 0.9 and 1.1 < max(shares) < 1.21
 
 
 def test_jpeg_comes_back_as_the_picture_in_the_same_colours() -> None:
@@ -61,10 +53,59 @@ def test_what_is_no_jpeg_is_refused() -> None:
         decoded(np.zeros(10, np.uint8))
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [{"brightness": 1.0}, {"noise_share": 1.1}, {"blur_px": 0.0}, {"jpeg_quality_min": 96}, {"noise": 100.0}],
-)
-def test_numbers_that_make_no_sense_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError):
-        AugmentConfig(**wrong)  # type: ignore[arg-type]
+@pytest.fixture(scope="module")
+def anchors() -> list[Anchor]:
+    return anchors_of(drive(frames=150))
+
+
+def drawn(anchor: Anchor, config: ShowConfig, count: int = 200) -> list[Anchor]:
+    rng = np.random.default_rng(1)
+    return [shifted(anchor, config, rng) for _ in range(count)]
+
+
+def test_the_newest_frame_is_any_of_those_around_and_its_waypoints_are_its_own(anchors: list[Anchor]) -> None:
+    recorded, anchor = drive(frames=150), anchors[11]
+    found = drawn(anchor, ShowConfig())
+    assert {each.k for each in found} == set(range(anchor.k - AROUND, anchor.k + AROUND + 1))
+    for each in found:
+        assert each.frames[-1] == each.k
+        assert np.allclose(each.points, recorded.plan_xy[each.k])
+        assert parse_waypoints(format_text(each.reasoning)) == pytest.approx(
+            np.round(np.array(each.points), 2), abs=0.06
+        )
+
+
+def test_the_way_is_told_in_the_frame_that_is_shown(anchors: list[Anchor]) -> None:
+    recorded, anchor = drive(frames=150), anchors[11]
+    for each in drawn(anchor, ShowConfig()):
+        T_shown_anchor = recorded.T_odom_base(each.k).inverse() @ recorded.T_odom_base(anchor.k)
+        moved = [T_shown_anchor @ SE2(x_m, y_m, 0.0) for x_m, y_m in anchor.way]
+        assert each.way == tuple(pytest.approx((point.x_m, point.y_m), abs=0.051) for point in moved)
+
+
+def test_older_frames_are_near_where_they_should_be_and_in_order(anchors: list[Anchor]) -> None:
+    for anchor in anchors:
+        for each in drawn(anchor, ShowConfig(shift_frames=0), 50):
+            assert list(each.frames) == sorted(set(each.frames)) and each.frames[0] >= 0
+            assert len(each.frames) == len(anchor.frames)
+            assert max(abs(a - b) for a, b in zip(each.frames, anchor.frames, strict=True)) <= 2
+
+
+def test_at_a_drives_ends_there_is_no_frame_beyond(anchors: list[Anchor]) -> None:
+    assert all(0 <= min(each.frames) <= each.k for each in drawn(anchors[0], ShowConfig()))
+    short = anchors_of(drive(frames=141))[-1]
+    assert short.k == 140 and max(each.k for each in drawn(short, ShowConfig())) == 140
+
+
+def test_a_robot_that_waits_is_shown_as_it_is(anchors: list[Anchor]) -> None:
+    still = waiting(anchors[0], 2)
+    assert all(each == still for each in drawn(still, ShowConfig(), 20))
+
+
+def test_noise_is_in_units_of_the_tokens_and_a_share_is_blank() -> None:
+    tokens = (3.0 * np.random.default_rng(2).standard_normal((2000, 8))).astype(np.float16)
+    (shown,) = disturbed((tokens,), ShowConfig(noise=0.2, drop=0.25), np.random.default_rng(1))
+    blank = ~np.any(shown, axis=1)
+    assert blank.mean() == pytest.approx(0.25, abs=0.03)
+    off = (shown.astype(np.float64) - tokens)[~blank]
+    assert off.std() == pytest.approx(0.6, rel=0.05) and shown.dtype == np.float16

@@ -16,13 +16,12 @@ from edge.state.reasoning_text import format_text
 from export.model.network import TicVla, build
 from export.model.tokenizers.nano import NANO_TOKENIZER
 from tests.support.train.train_drives import MadeUpTokens, made_up_drive, tiny_model, write_dataset
+from tools.train.config.checks import TrainError
 from tools.train.config.imitate import KvConfig
 from tools.train.config.sft import DrawConfig
 from tools.train.drives.drive import Dataset
-from tools.train.run.distributed import Ranks
-from tools.train.samples.anchors import WAYPOINTS_START, Drawn, Prompts, anchors_of
-from tools.train.samples.kv_build import build_kv_cache, cache_key
-from tools.train.samples.kv_cache import KvCache, KvCacheError
+from tools.train.samples.anchors import Drawn, Prompts, anchors_of
+from tools.train.samples.kv_cache import KvCache, build_kv_cache, cache_key
 
 CONTENT = NANO_TOKENIZER.read_bytes()
 TOKENS = MadeUpTokens()
@@ -82,14 +81,6 @@ def test_a_state_is_what_the_language_model_leaves_of_prompt_and_true_text(
         assert state.prompt_tokens == len(prompt)
         expected = left_by(network, anchor.frames, [*prompt, *answer[:-1]])
         np.testing.assert_allclose(state.kv, expected, atol=ROUNDING)
-
-
-def test_states_of_waypoints_alone_begin_as_they_were_asked_to(
-    tmp_path: Path, network: TicVla, dataset: Dataset
-) -> None:
-    only = dataclasses.replace(CONFIG, words=dataclasses.replace(RIGHT, waypoints_only=1.0))
-    state = made(tmp_path, network, dataset, only).at("a", 30)
-    assert state.text.startswith(WAYPOINTS_START) and state.waypoints is not None
 
 
 def test_a_state_with_its_own_text_is_of_that_text(
@@ -152,41 +143,16 @@ def test_other_weights_other_words_and_another_drive_are_another_cache(
     assert cache.has("a", dataset.entries[0].sha256) and not cache.has("a", "0" * 64)
 
 
-def test_an_action_expert_that_has_learned_leaves_the_cache_as_it_is() -> None:
-    learned = build(tiny_model(), 1)
-    torch.nn.init.ones_(learned.action.out.bias)
-    assert cache_key(learned, CONTENT, CONFIG, 3) == cache_key(build(tiny_model(), 1), CONTENT, CONFIG, 3)
-
-
-def test_ranks_share_the_drives(tmp_path: Path, cache: KvCache, network: TicVla, dataset: Dataset) -> None:
-    class Alone(Ranks):
-        def barrier(self) -> None:
-            """The other rank's turn comes later."""
-
-    for rank in (0, 1):
-        both = build_kv_cache(tmp_path, network, CONTENT, dataset, TOKENS, CONFIG, seed=3, ranks=Alone(rank, 2))
-        assert [(both.folder / f"{name}.npy").exists() for name in ("a", "b")] == [True, rank == 1]
-    for name in ("a.npy", "b.npy", "a.json", "b.json"):
-        assert (both.folder / name).read_bytes() == (cache.folder / name).read_bytes()
-
-
-def test_only_the_drives_that_are_asked_for_are_made(tmp_path: Path, network: TicVla, dataset: Dataset) -> None:
-    some = build_kv_cache(tmp_path, network, CONTENT, dataset, TOKENS, CONFIG, seed=3, ids=("b",))
-    assert some.anchors("b") == (0, 10)
-    with pytest.raises(KvCacheError, match="no states of this drive"):
-        some.anchors("a")
-
-
 def test_a_cache_that_is_not_whole_is_refused(tmp_path: Path, cache: KvCache) -> None:
-    with pytest.raises(KvCacheError, match="no state of frame 7"):
+    with pytest.raises(TrainError, match="no state of frame 7"):
         cache.at("a", 7)
-    with pytest.raises(KvCacheError, match="build it first"):
+    with pytest.raises(TrainError, match="build it first"):
         KvCache(tmp_path / "nowhere")
     shutil.copytree(cache.folder, tmp_path / "copy")
     np.save(tmp_path / "copy" / "b.npy", np.zeros((3, 32), np.float16))
-    with pytest.raises(KvCacheError, match="expected f16"):
+    with pytest.raises(TrainError, match="expected f16"):
         KvCache(tmp_path / "copy").at("b", 0)
     index = json.loads((tmp_path / "copy" / "kv.json").read_text())
     (tmp_path / "copy" / "kv.json").write_text(json.dumps({**index, "format": 9}))
-    with pytest.raises(KvCacheError, match="format 1"):
+    with pytest.raises(TrainError, match="format 1"):
         KvCache(tmp_path / "copy")

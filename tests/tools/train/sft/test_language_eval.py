@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from types import SimpleNamespace
 
@@ -10,11 +9,11 @@ import numpy as np
 import pytest
 
 from edge.reasoning.decoding_rules import BACK, EITHER_WAY, FREE, ONWARD, DecodingContext
-from edge.state.reasoning_text import Progress, format_progress, format_text, parse_text
+from edge.state.reasoning_text import Progress, format_progress, format_text
 from tests.support.train.train_drives import WORDINGS, made_up_drive
 from tools.train.config.sft import EvalConfig
 from tools.train.samples.anchors import Anchor, Drawn, anchors_of
-from tools.train.sft.language_eval import Score, closed_loop, landmarks_of, side_of
+from tools.train.sft.language_eval import Score, closed_loop
 
 
 @pytest.fixture(scope="module")
@@ -54,35 +53,6 @@ def test_nothing_is_right_about_a_text_of_another_form(anchors: list[Anchor]) ->
     shares = ("waypoints_parsable", "progress_parsable", "progress_right", "side_right", "landmark_recall")
     assert all(numbers[key] == 0.0 for key in shares)
     assert numbers["landmark_precision"] is None and numbers["waypoint_error_m"] is None
-
-
-def test_errors_are_distances_at_three_six_and_nine_seconds(anchors: list[Anchor]) -> None:
-    score = Score(2.0)
-    score.add("waypoints: (1.5, 0.3) (3.0, 0.0) (3.0, 0.5)", anchors[0])
-    assert score.points()["waypoint_error_m"] == pytest.approx([0.3, 0.0, 1.0])
-
-
-def test_landmarks_are_counted_by_name(anchors: list[Anchor]) -> None:
-    score = Score(2.0)
-    wrong = format_text(anchors[0].reasoning).replace("red chair right", "desk ahead")
-    assert landmarks_of(parse_text(wrong)) == Counter({"desk": 2})
-    assert landmarks_of(anchors[0].reasoning) == Counter({"desk": 1, "red chair": 1})
-    assert landmarks_of(anchors[-1].reasoning) == Counter()
-    score.add(wrong, anchors[0])
-    assert score.numbers()["landmark_precision"] == score.numbers()["landmark_recall"] == 0.5
-
-
-@pytest.mark.parametrize(
-    ("plan", "side"),
-    [
-        ("turn left into the room in 3 m", "left"),
-        ("wait, then turn right into the aisle now", "right"),
-        ("go straight to the lobby in 4 m", None),
-        ("stop in 6 m", None),
-    ],
-)
-def test_the_side_is_that_of_the_planned_turn(plan: str, side: str | None) -> None:
-    assert side_of(parse_text(f"Objects: desk right 3 m.\nPlan: {plan}.\nwaypoints: …")) == side
 
 
 class Parrot:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,27 +11,19 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
-from tokenizers import Tokenizer
 
-from export.model.network import build
-from export.model.tokenizers.nano import NANO_TOKENIZER
-from tests.support.train.train_drives import MadeUpTokens, made_up_drive, small_dataset, tiny_model, write_dataset
+from tests.support.train.train_drives import made_up_drive, small_dataset, write_dataset
 from tests.support.train.train_sft_rank import CONFIG, sft_job, trained
 from tests.support.train.train_stage_contract import Run, StageContract
-from tests.support.train.training_scenarios import drive_along, scenarios
+from tools.train.config.checks import OptimConfig, TrainError
 from tools.train.config.collect import CollectConfig, TourConfig
-from tools.train.config.optim import OptimConfig
 from tools.train.config.recipe import load_recipe
-from tools.train.config.sft import RelabelConfig, SftConfig
+from tools.train.config.sft import SftConfig
 from tools.train.drives.drive import Dataset
-from tools.train.pipeline.budget import budget_of
-from tools.train.pipeline.chain import Step, run_step
-from tools.train.run import optim
+from tools.train.pipeline.chain import Step, budget_of, run_step
 from tools.train.run.job import StageJob
 from tools.train.run.network_file import stage_weights
-from tools.train.samples.anchors import Prompts, anchors_of
-from tools.train.samples.mirror import Views
-from tools.train.sft.sft import Samples, SftError, budget, run
+from tools.train.sft.sft import run
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -75,19 +65,8 @@ def test_the_loss_falls_on_what_is_learned_and_on_what_is_held_out(tmp_path: Pat
     assert held[-1] < 0.7 * held[0]
 
 
-@pytest.mark.slow
-def test_the_merge_layer_learns_and_all_but_the_language_model_stays(
-    whole: Run,
-) -> None:
-    before = build(tiny_model(), 1).state_dict()
-    moved = {name for name, tensor in whole.weights.items() if not torch.equal(tensor, before[name])}
-    assert {name.split(".")[0] for name in moved} == {"language"}
-    assert {"language.merge.1.weight", "language.embed.weight", "language.lm_head.weight"} <= moved
-
-
 class TestStage(StageContract):
     rank = "tests.support.train.train_sft_rank"
-    error = SftError
     other = dataclasses.replace(CONFIG, batch=7)
 
     @pytest.fixture(autouse=True)
@@ -101,21 +80,9 @@ class TestStage(StageContract):
         return run_of(self._dataset, sft_job(out, config or CONFIG, **options))
 
 
-def test_bfloat16_gives_about_the_same_losses(
-    tmp_path: Path, dataset: Dataset, whole: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(optim, "computes_bf16", lambda _device: True)  # slowly, where there are no instructions for it
-    half = dataclasses.replace(CONFIG, optim=dataclasses.replace(CONFIG.optim, bf16=True))
-    job = sft_job(tmp_path, half)
-    trained(dataset, job)
-    losses = [line["loss"] for line in job.run_dir.lines()]
-    assert losses == pytest.approx([line["loss"] for line in whole.lines], rel=0.02)
-    assert losses != [line["loss"] for line in whole.lines]
-
-
 def test_drives_without_traces_cannot_be_learned_from(tmp_path: Path) -> None:
     silent = write_dataset(tmp_path / "collect", [made_up_drive("a", 20, traces=())])
-    with pytest.raises(SftError, match="no anchors"):
+    with pytest.raises(TrainError, match="no anchors"):
         trained(silent, sft_job(tmp_path))
 
 
@@ -143,42 +110,6 @@ def test_after_a_round_of_dagger_it_goes_on_from_what_it_was(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_drives_are_shown_under_other_instructions_too(tmp_path: Path) -> None:
-    write_dataset(tmp_path / "collect", [drive_along(scenarios("corridor")[0]), made_up_drive("b")])
-    silent = dataclasses.replace(CONFIG.evaluate, anchors=0, epoch_anchors=0, drives=0)
-    config = dataclasses.replace(CONFIG, epochs=1, evaluate=silent)
-    plain = run(sft_job(tmp_path, config))
-    shutil.rmtree(tmp_path / "sft")
-    more = run(sft_job(tmp_path, dataclasses.replace(config, retold=RelabelConfig(ways=2, tries=24))))
-    assert plain["more_anchors"] == 0 < more["more_anchors"] == more["anchors"] - plain["anchors"]
-
-
-def test_anchors_that_decide_are_shown_as_often_as_told(dataset: Dataset) -> None:
-    anchors = [anchor for drive in dataset.drives(dataset.train, pictures=False) for anchor in anchors_of(drive)]
-    prompts = Prompts(Tokenizer.from_file(str(NANO_TOKENIZER)), tiny_model())
-    samples = Samples(anchors, prompts, Views(MadeUpTokens()), CONFIG.words, deciding=3)
-    shown = Counter(sample.anchor for sample in samples.draw(np.random.default_rng(0)))
-    assert {anchors[i].decides for i in shown} == {True, False}
-    assert all(count == (3 if anchors[i].decides else 1) for i, count in shown.items()) and len(shown) == len(anchors)
-
-
-def test_its_budget_grows_with_what_is_shown_again_and_told_anew() -> None:
-    recipe = load_recipe("nano", ["collect.episodes=10", "sft.epochs=2", "sft.deciding=1", "sft.tours.count=0"])
-
-    def lines(**changed: Any) -> list[tuple[str, int, str]]:
-        sft = dataclasses.replace(recipe.sft or SftConfig(), **changed)
-        return budget(dataclasses.replace(recipe, sft=sft))
-
-    def anchors(**changed: Any) -> int:
-        return sum(count for _, count, key in lines(**changed) if key == "sft")
-
-    assert anchors() == 10 * 30 * 2
-    assert anchors() < anchors(deciding=2) < anchors(deciding=2, retold=RelabelConfig(ways=2))
-    assert anchors(tours=TourConfig(count=4)) == anchors() + 4 * 45 * 2
-    assert ("tours: made", 4, "tour") in lines(tours=TourConfig(count=4))
-
-
-@pytest.mark.slow
 def test_after_a_round_of_dagger_a_share_of_the_tours_is_learned_again_and_none_is_made(tmp_path: Path) -> None:
     small_dataset(tmp_path / "collect")
     silent = dataclasses.replace(CONFIG.evaluate, anchors=0, epoch_anchors=0, drives=0)
@@ -201,11 +132,6 @@ def test_the_budget_of_a_round_has_no_tours_to_make() -> None:
     assert lines["tours: made"] == 100 and not {"tours: made", "tours: frames encoded"} & set(later)
     share = (recipe.sft or SftConfig()).go_on_share
     assert later["tours: anchors learned"] == round(lines["tours: anchors learned"] * share * 0.1)
-
-
-def test_the_recipes_numbers_are_checked() -> None:
-    with pytest.raises(ValueError, match="from 1 on"):
-        SftConfig(batch=0)
 
 
 @pytest.mark.slow

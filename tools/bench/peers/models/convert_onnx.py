@@ -10,29 +10,21 @@ import onnx
 import torch
 from onnxruntime.quantization import QuantType, quantize_dynamic
 
-from tools.bench.peers.models.unsplit import load_action
+from tools.bench.peers.models.reference import load_action
 from tools.bench.peers.workload import Workload
-
-GENAI_OPTIONS = {
-    "int4": ["int4_block_size=128", "int4_accuracy_level=4"],
-    "int4-b32": ["int4_block_size=32", "int4_accuracy_level=4"],
-    "int8": [],
-}
 
 
 def write_action(workload: Workload, reference: Path, folder: Path, kind: str) -> None:
     """Write the unsplit action expert in `fp32` or with dynamic `int8` (u8 activations, s8 weights)."""
     folder.mkdir(parents=True, exist_ok=True)
-    config = workload.config
-    visual = torch.zeros(1, config.vision.tokens, config.vision.token_dim)
-    given = (workload.state(), workload.latency(), workload.last_layer_kv())
+    inputs = workload.action_inputs()
     plain = folder / "plain.onnx"
     target = plain if kind == "int8" else folder / "model.onnx"
     torch.onnx.export(
-        load_action(config, reference),
-        (visual, *(torch.from_numpy(x) for x in given)),
+        load_action(workload.config, reference),
+        tuple(map(torch.from_numpy, inputs.values())),
         str(target),
-        input_names=["visual_tokens", "state", "latency", "last_layer_kv"],
+        input_names=list(inputs),
         output_names=["trajectory"],
         external_data=False,
         dynamo=True,
@@ -47,10 +39,8 @@ def write_action(workload: Workload, reference: Path, folder: Path, kind: str) -
 
 
 def write_genai(workload: Workload, reference: Path, folder: Path, kind: str) -> None:
-    """Run the builder of ONNX Runtime GenAI on the Hugging Face directory of the workload's model."""
-    precision = kind.partition("-")[0]
+    """Run the builder of ONNX Runtime GenAI on the Hugging Face directory of the workload's model, in `int4`."""
     command = [sys.executable, "-m", "onnxruntime_genai.models.builder", "-i", str(reference / "language")]
-    command += ["-o", str(folder), "-p", precision, "-e", "cpu", "-c", str(folder / "builder-cache")]
-    if GENAI_OPTIONS[kind]:
-        command += ["--extra_options", *GENAI_OPTIONS[kind]]
+    command += ["-o", str(folder), "-p", kind, "-e", "cpu", "-c", str(folder / "builder-cache")]
+    command += ["--extra_options", "int4_block_size=128", "int4_accuracy_level=4"]
     subprocess.run(command, check=True)

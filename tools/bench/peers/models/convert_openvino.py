@@ -18,7 +18,7 @@ from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 from transformers import AutoTokenizer
 
 from export.model.config import LanguageConfig
-from tools.bench.peers.models.unsplit import load_action, load_vision
+from tools.bench.peers.models.reference import load_action, load_vision, qwen_name
 from tools.bench.peers.workload import Workload
 
 CALIBRATION_FRAMES = 4
@@ -109,24 +109,16 @@ class Qwen(nn.Module):
         return self.lm_head(x), *present
 
 
-def _our_name(qwen: str) -> str:
-    from tools.bench.peers.models.reference import LAYER_NAMES
-
-    parts = qwen.split(".")
-    if parts[1:2] == ["layers"]:
-        back = {theirs: ours for ours, theirs in LAYER_NAMES.items()}
-        inner = back[".".join(parts[3:-1])]
-        return f"layers.{parts[2]}.{inner}" + ("" if inner.endswith("norm") else f".{parts[-1]}")
-    return {"model.embed_tokens.weight": "embed.weight", "model.norm.weight": "norm"}.get(qwen, qwen)
-
-
 def language_model(workload: Workload, reference: Path) -> ov.Model:
     """The stateful decoder in fp32."""
     c = workload.config.language
     with torch.device("meta"):
         model = Qwen(c)
     with safe_open(str(reference / "language" / "model.safetensors"), framework="pt") as file:
-        tensors = {_our_name(name): file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
+        tensors = {}
+        for name in model.state_dict():  # a norm's parameter has no module of its own here
+            whole = name if name.endswith((".weight", ".bias")) else f"{name}.weight"
+            tensors[name] = file.get_tensor(qwen_name(whole))
     model.load_state_dict(tensors, assign=True)
     inv_freq = c.rope_theta ** (-torch.arange(0, c.head_dim, 2).float() / c.head_dim)
     model.inv_freq = inv_freq[None, :, None]
@@ -158,7 +150,7 @@ def language_model(workload: Workload, reference: Path) -> ov.Model:
 
 
 def _reset_caches_to_batch(model: ov.Model, c: LanguageConfig) -> None:
-    """A cache starts empty at the batch size of the ids, which the fused attention needs to be told."""
+    """A cache starts empty at the batch size of the ids, which the fused attention requires."""
     from openvino import opset13 as ops
 
     ids = model.input("input_ids")
@@ -206,12 +198,10 @@ def write_encoder(workload: Workload, reference: Path, folder: Path, kind: str) 
 
 def write_action(workload: Workload, reference: Path, folder: Path, kind: str) -> None:
     """Write the unsplit action expert in `fp32` or NNCF `int8`."""
-    config = workload.config
-    visual = np.random.default_rng(2).standard_normal((1, config.vision.tokens, config.vision.token_dim))
-    inputs = (visual.astype(np.float32), workload.state(), workload.latency(), workload.last_layer_kv())
+    inputs = tuple(workload.action_inputs().values())
     with torch.no_grad():
         example = tuple(torch.from_numpy(x) for x in inputs)
-        model = ov.convert_model(load_action(config, reference), example_input=example)
+        model = ov.convert_model(load_action(workload.config, reference), example_input=example)
     model.reshape({port: list(x.shape) for port, x in zip(model.inputs, inputs, strict=True)})
     _save(_int8(model, [dict(enumerate(inputs))]) if kind == "int8" else model, folder)
 

@@ -1,5 +1,4 @@
-"""Everything that a contender opens, made once and stamped: `python -m tools.bench.peers.models.prepare` in the peers'
-venv.
+"""Everything that a contender opens, made once and stamped: run as a module by the Python of the peers' environment.
 
 A stamp is written last and names the recipe and the versions it was made with; what has its stamp is not made again.
 """
@@ -13,7 +12,6 @@ import json
 import shutil
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,43 +20,22 @@ RECIPE = 1
 """Raised whenever what a converter writes changes."""
 
 
-@dataclass(frozen=True)
-class Asset:
-    """A folder below the model's cache folder, the function that fills it, and the packages it depends on."""
-
-    folder: str
-    module: str
-    function: str
-    kind: str
-    packages: tuple[str, ...]
-
-
-def _asset(folder: str, module: str, function: str, *packages: str) -> Asset:
-    kind = folder.rpartition("/")[2].partition("-")[2]
-    return Asset(folder, "tools.bench.peers.models.convert_" + module, function, kind, packages)
-
-
-_OV = ("openvino", "nncf")
+_OPENVINO = ("openvino", "nncf")
+_ONNXRUNTIME = ("onnxruntime", "onnx")
 ASSETS = {
-    asset.folder: asset
-    for asset in (
-        _asset("openvino/encoder-fp32", "openvino", "write_encoder", *_OV),
-        _asset("openvino/encoder-int8", "openvino", "write_encoder", *_OV),
-        _asset("openvino/action-fp32", "openvino", "write_action", *_OV),
-        _asset("openvino/action-int8", "openvino", "write_action", *_OV),
-        _asset("openvino/language-int8", "openvino", "write_language", *_OV),
-        _asset("openvino/language-int4", "openvino", "write_language", *_OV),
-        _asset("onnxruntime/action-fp32", "onnx", "write_action", "onnxruntime", "onnx"),
-        _asset("onnxruntime/action-int8", "onnx", "write_action", "onnxruntime", "onnx"),
-        _asset("llama/language-q4_0", "gguf", "write_gguf", "gguf"),
-        _asset("llama/language-q8_0", "gguf", "write_gguf", "gguf"),
-        _asset("genai/language-int4", "onnx", "write_genai", "onnxruntime-genai"),
-    )
+    "openvino/encoder-fp32": ("convert_openvino", "write_encoder", _OPENVINO),
+    "openvino/encoder-int8": ("convert_openvino", "write_encoder", _OPENVINO),
+    "openvino/action-fp32": ("convert_openvino", "write_action", _OPENVINO),
+    "openvino/action-int8": ("convert_openvino", "write_action", _OPENVINO),
+    "openvino/language-int8": ("convert_openvino", "write_language", _OPENVINO),
+    "openvino/language-int4": ("convert_openvino", "write_language", _OPENVINO),
+    "onnxruntime/action-fp32": ("convert_onnx", "write_action", _ONNXRUNTIME),
+    "onnxruntime/action-int8": ("convert_onnx", "write_action", _ONNXRUNTIME),
+    "llama/language-q4_0": ("convert_gguf", "write_gguf", ("gguf",)),
+    "llama/language-q8_0": ("convert_gguf", "write_gguf", ("gguf",)),
+    "genai/language-int4": ("convert_onnx", "write_genai", ("onnxruntime-genai",)),
 }
-
-
-def _fill(write: Callable[..., None], workload: object, reference: Path, kind: str, folder: Path) -> None:
-    write(workload, reference, folder, kind)
+"""Folder below the model's cache folder (RUNTIME/PART-KIND) → module and function that fill it, and its packages."""
 
 
 def stamp(packages: tuple[str, ...]) -> dict[str, Any]:
@@ -67,7 +44,7 @@ def stamp(packages: tuple[str, ...]) -> dict[str, Any]:
 
 
 def make(folder: Path, content: dict[str, Any], fill: Callable[[Path], None]) -> bool:
-    """Fill a folder unless its stamp says that it is as wanted; returns whether there was work to do."""
+    """Fill a folder unless its stamp has this content; returns whether there was work to do."""
     seal = folder / "stamp.json"
     if seal.is_file() and json.loads(seal.read_text(encoding="utf-8")) == content:
         return False
@@ -97,10 +74,11 @@ def main(argv: list[str] | None = None) -> int:
     for name in args.assets:
         if name == "reference":
             continue
-        asset = ASSETS[name]
+        module, function, packages = ASSETS[name]
         sys.stderr.write(f"preparing {name}\n")
-        write = getattr(importlib.import_module(asset.module), asset.function)
-        make(root / name, stamp(asset.packages), partial(_fill, write, workload, reference, asset.kind))
+        write = getattr(importlib.import_module(f"tools.bench.peers.models.{module}"), function)
+        kind = name.partition("-")[2]
+        make(root / name, stamp(packages), partial(write, workload, reference, kind=kind))
     return 0
 
 

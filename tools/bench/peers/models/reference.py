@@ -1,4 +1,7 @@
-"""The weights that all contenders share: our network, seed 0, its language model as a Hugging Face directory."""
+"""The weights that all contenders share: our network, seed 0, its language model as a Hugging Face directory.
+
+The peers run encoder and action expert as PyTorch modules, the latter in one piece.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +9,13 @@ import json
 from pathlib import Path
 
 import torch
-from safetensors.torch import save_file
-from tokenizers import Tokenizer, models
-from torch import Tensor
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
 
-from export.model.config import LanguageConfig
+from export.model.action import ActionExpert
+from export.model.config import LanguageConfig, TicVlaConfig
 from export.model.network import build
+from export.model.vision import VisionEncoder, pixel_shuffle_v2
 from tools.bench.peers.workload import SEED, Workload
 
 LAYER_NAMES = {
@@ -64,6 +68,8 @@ def qwen_config(c: LanguageConfig, dtype: str) -> dict[str, object]:
 
 def write_hugging_face(folder: Path, config: LanguageConfig, tensors: dict[str, Tensor], dtype: str) -> None:
     """Write a Qwen2 directory; its tokenizer only names ids, since every contender is given ids."""
+    from tokenizers import Tokenizer, models  # here: a worker that imports this module is measured
+
     folder.mkdir(parents=True, exist_ok=True)
     kind = {"float32": torch.float32, "bfloat16": torch.bfloat16}[dtype]
     save_file({name: t.to(kind) for name, t in tensors.items()}, str(folder / "model.safetensors"), {"format": "pt"})
@@ -89,3 +95,63 @@ def write_reference(workload: Workload, folder: Path) -> None:
     config = workload.config.language
     for dtype, place in (("float32", "language"), ("bfloat16", "language-bf16")):
         write_hugging_face(folder / place, config, language, dtype)
+
+
+class UnsplitAction(nn.Module):
+    """Context projection and step in one forward, as every peer would run the action expert."""
+
+    def __init__(self, expert: ActionExpert) -> None:
+        super().__init__()
+        self.expert = expert
+
+    def forward(self, visual_tokens: Tensor, state: Tensor, latency: Tensor, last_layer_kv: Tensor) -> Tensor:
+        """Trajectory [1, steps, 3] from visual tokens, state, latency and the semantic state [1, T, kv_dim]."""
+        keys, values = self.expert.context(last_layer_kv)
+        trajectory: Tensor = self.expert(visual_tokens, state, latency, keys, values)
+        return trajectory
+
+
+class FixedEncoder(nn.Module):
+    """The encoder with its grid as a number: a tracer cannot take the root of a traced count of tokens."""
+
+    def __init__(self, encoder: VisionEncoder) -> None:
+        super().__init__()
+        self.encoder = encoder
+
+    def forward(self, frame: Tensor) -> Tensor:
+        """Visual tokens [1, N, D] of a frame [1, px, px, 3]."""
+        e, c = self.encoder, self.encoder.config
+        pixels = ((frame.float() - e.mean) * e.inv_std).to(e.cls.dtype)
+        x = e.embed(pixels.permute(0, 3, 1, 2)).flatten(2).transpose(1, 2)
+        x = torch.cat([e.cls, x], dim=1) + e.position
+        for block in e.blocks:
+            x = block(x)
+        x = x[:, 1:].reshape(1, c.grid, c.grid, c.hidden)
+        if c.pixel_shuffle > 1:
+            x = pixel_shuffle_v2(x, c.pixel_shuffle)
+        tokens: Tensor = e.projector(x.reshape(1, c.tokens, c.hidden * c.pixel_shuffle**2))
+        return tokens
+
+
+def _filled(module: nn.Module, path: Path) -> None:
+    module.load_state_dict(load_file(str(path)), assign=True)
+    module.eval().requires_grad_(False)
+
+
+def load_vision(config: TicVlaConfig, reference: Path) -> FixedEncoder:
+    """The encoder with the reference's weights."""
+    # On "meta" nothing is allocated: a peer's peak memory must not hold weights that are replaced at once.
+    with torch.device("meta"):
+        encoder = VisionEncoder(config.vision)
+    encoder.mean = torch.tensor(config.vision.mean) * 255
+    encoder.inv_std = 1 / (torch.tensor(config.vision.std) * 255)
+    _filled(encoder, reference / "vision.safetensors")
+    return FixedEncoder(encoder)
+
+
+def load_action(config: TicVlaConfig, reference: Path) -> UnsplitAction:
+    """The unsplit action expert with the reference's weights."""
+    with torch.device("meta"):
+        expert = ActionExpert(config)
+    _filled(expert, reference / "action.safetensors")
+    return UnsplitAction(expert)

@@ -18,11 +18,11 @@ LOAD_MODES = {"read": llama.LLAMA_LOAD_MODE_NONE, "mapped": llama.LLAMA_LOAD_MOD
 
 
 class Decoder:
-    """Greedy decoding; options: `extra_buffers` (repacking), `weights` (mapped, read), `flash`, `cache`, `ubatch`."""
+    """Greedy decoding; options: `extra_buffers` (repacking), `weights` (mapped, read)."""
 
     def __init__(self, load: Load, workload: Workload) -> None:
-        options = {key.partition(".")[2]: v for key, v in load.options.items() if key.startswith("language.")}
-        path = load.cache / load.model / "llama" / f"language-{options.pop('form')}" / "model.gguf"
+        options, path = load.of("language"), load.folder("llama", "language") / "model.gguf"
+        del options["form"]
         model = llama.llama_model_default_params()
         model.n_gpu_layers = 0
         model.use_extra_bufts = BOOLEANS[options.pop("extra_buffers", "true")]
@@ -33,13 +33,8 @@ class Decoder:
         context = llama.llama_context_default_params()
         context.n_ctx = 256 * (-(-(workload.semantic_tokens + 8) // 256))
         context.n_batch = workload.prompt_tokens
-        context.n_ubatch = int(options.pop("ubatch", "512"))
+        context.n_ubatch = 512
         context.n_threads = context.n_threads_batch = load.threads
-        if "flash" in options:
-            context.flash_attn_type = int(BOOLEANS[options.pop("flash")])
-        if "cache" in options:
-            kinds = {"f16": llama.GGML_TYPE_F16, "q8_0": llama.GGML_TYPE_Q8_0}
-            context.type_k = context.type_v = kinds[options.pop("cache")]
         if options:
             raise ValueError(f"unknown options {sorted(options)}")
         self._context = llama.llama_init_from_model(self._model, context)

@@ -1,16 +1,20 @@
-"""OpenVINO: encoder, unsplit action expert and stateful decoder; options are passed on as plugin properties."""
+"""OpenVINO: encoder, unsplit action expert and stateful decoder, or that decoder in OpenVINO GenAI's own pipeline.
+
+Options are passed on as plugin properties. `python -m … openvino_genai`: the pipeline.
+"""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 import openvino as ov
 from numpy.typing import NDArray
 
-from tools.bench.peers.workers.serve import Load, Task, action_task, encoder_task, language_task, serve, tick_task
+from tools.bench.peers.workers.serve import Load, Task, language_task, serve, timed_task
 from tools.bench.peers.workload import DECODE_STEPS, Workload
 
 
@@ -44,56 +48,79 @@ class Decoder:
         return self._infer(np.array([[token]], dtype=np.int64))
 
 
-class Openvino:
-    """Opens converted models with `threads` threads; `encoder.hint` etc. choose precision hints by part."""
-
-    def __init__(self, load: Load) -> None:
-        self._load = load
-        self._core = ov.Core()
-        self._folder = load.cache / load.model / "openvino"
-
-    def open(self, part: str) -> ov.CompiledModel:
-        """The part's model in the form that the options name."""
-        options = {key.partition(".")[2]: v for key, v in self._load.options.items() if key.startswith(part + ".")}
-        model = self._folder / f"{part}-{options.pop('form')}" / "openvino_model.xml"
-        properties = {
-            "INFERENCE_NUM_THREADS": self._load.threads,
-            "NUM_STREAMS": 1,
-            "PERFORMANCE_HINT": "LATENCY",
-            # The harness pins the process; the plugin's own pinning would count cores that it may not use.
-            "ENABLE_CPU_PINNING": False,
-            **options,
-        }
-        return self._core.compile_model(str(model), "CPU", properties)
+def compiled(core: ov.Core, request: Load, part: str) -> ov.CompiledModel:
+    """A part's model in the form and with the precision hint that the options name."""
+    options = request.of(part)
+    del options["form"]
+    properties = {
+        "INFERENCE_NUM_THREADS": request.threads,
+        "NUM_STREAMS": 1,
+        "PERFORMANCE_HINT": "LATENCY",
+        # The harness pins the process; the plugin's own pinning would count cores that it may not use.
+        "ENABLE_CPU_PINNING": False,
+        **options,
+    }
+    model = request.folder("openvino", part) / "openvino_model.xml"
+    return core.compile_model(str(model), "CPU", properties)
 
 
 def load(request: Load) -> Mapping[str, Task]:
     """Open the parts asked for."""
-    workload, runtime = Workload(request.model), Openvino(request)
+    workload, core = Workload(request.model), ov.Core()
     tasks: dict[str, Task] = {}
     if "encoder" in request.parts:
-        vision = runtime.open("encoder").create_infer_request()
+        vision = compiled(core, request, "encoder").create_infer_request()
+        see = partial(vision.infer, share_inputs=True, share_outputs=True)
         frame = workload.frame()
-        tasks["encoder"] = encoder_task(lambda: vision.infer([frame], share_inputs=True, share_outputs=True))
+        tasks["encoder"] = timed_task("encoder_ms", lambda: see([frame]))
     if "action" in request.parts:
-        action = runtime.open("action").create_infer_request()
-        shape = (1, workload.config.vision.tokens, workload.config.vision.token_dim)
-        visual = np.random.default_rng(2).standard_normal(shape).astype(np.float32)
-        rest = [workload.state(), workload.latency(), workload.last_layer_kv()]
-        tasks["action"] = action_task(lambda: action.infer([visual, *rest], share_inputs=True, share_outputs=True))
+        action = compiled(core, request, "action").create_infer_request()
+        visual, *rest = workload.action_inputs().values()
+        plan = partial(action.infer, share_inputs=True, share_outputs=True)
+        tasks["action"] = timed_task("action_ms", lambda: plan([visual, *rest]))
         if "encoder" in request.parts:
 
             def tick() -> None:
-                tokens = vision.infer([frame], share_inputs=True, share_outputs=True)[0]
-                action.infer([tokens, *rest], share_inputs=True, share_outputs=True)
+                tokens = see([frame])[0]
+                plan([tokens, *rest])
 
-            tasks["tick"] = tick_task(tick)
+            tasks["tick"] = timed_task("tick_ms", tick)
     if "language" in request.parts:
-        decoder = Decoder(runtime.open("language"))
+        decoder = Decoder(compiled(core, request, "language"))
         ids = workload.text_ids(workload.prompt_tokens)[None]
         tasks["language"] = language_task(lambda: decoder.prefill(ids), decoder.step, DECODE_STEPS)
     return tasks
 
 
+def load_genai(request: Load) -> Mapping[str, Task]:
+    """Open the language model; times are GenAI's own: to the first token, and the mean of those after it."""
+    import openvino_genai as genai  # here: a worker's memory is measured
+
+    workload = Workload(request.model)
+    options: dict[str, Any] = request.of("language")
+    del options["form"]
+    scheduler = options["scheduler_config"] = genai.SchedulerConfig()
+    # Every round has the same prompt: with prefixes cached, prefill would be measured once and then skipped.
+    scheduler.enable_prefix_caching = False
+    scheduler.max_num_batched_tokens = workload.prompt_tokens
+    options |= {"INFERENCE_NUM_THREADS": request.threads, "ENABLE_CPU_PINNING": False}
+    pipeline = genai.LLMPipeline(str(request.folder("openvino", "language")), "CPU", **options)
+    config = genai.GenerationConfig()
+    config.max_new_tokens, config.ignore_eos, config.do_sample = DECODE_STEPS + 1, True, False
+    ids = workload.text_ids(workload.prompt_tokens)[None]
+    prompt = genai.TokenizedInputs(ov.Tensor(ids), ov.Tensor(np.ones_like(ids)))
+
+    def run() -> dict[str, float]:
+        made = pipeline.generate(prompt, config)
+        if len(made.tokens[0]) != DECODE_STEPS + 1:
+            raise ValueError(f"{len(made.tokens[0])} tokens generated, expected {DECODE_STEPS + 1}")
+        times = made.perf_metrics
+        return {"prefill_ms": times.get_ttft().mean, "decode_tokens_per_s": 1e3 / times.get_tpot().mean}
+
+    return {"language": run}
+
+
 if __name__ == "__main__":
+    if sys.argv[1] == "openvino_genai":
+        sys.exit(serve(load_genai, ("openvino-genai", "openvino")))
     sys.exit(serve(load, ("openvino", "nncf")))

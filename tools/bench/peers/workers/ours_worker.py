@@ -14,7 +14,7 @@ from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
 from edge.reasoning.prompt import Segment
 from edge.state.semantic import SemanticState
-from tools.bench.peers.workers.serve import Load, Task, action_task, encoder_task, serve, tick_task
+from tools.bench.peers.workers.serve import Load, Task, serve, timed_task
 from tools.bench.peers.workload import DECODE_STEPS, FRAMES, Workload
 
 HERE = SE2(0.0, 0.0, 0.0)
@@ -57,9 +57,9 @@ def load(request: Load) -> Mapping[str, Task]:
         semantic = SemanticState(0, 0, HERE, 0, kv, policy.semantic_context(kv), "", None)
         state = (0.4, 0.0, 0.0)
         tokens = policy.encode(frame)
-        tasks["encoder"] = encoder_task(lambda: policy.encode(frame))
-        tasks["action"] = action_task(lambda: policy.act(tokens, state, 2.0, HERE, semantic))
-        tasks["tick"] = tick_task(lambda: policy.act(policy.encode(frame), state, 2.0, HERE, semantic))
+        tasks["encoder"] = timed_task("encoder_ms", lambda: policy.encode(frame))
+        tasks["action"] = timed_task("action_ms", lambda: policy.act(tokens, state, 2.0, HERE, semantic))
+        tasks["tick"] = timed_task("tick_ms", lambda: policy.act(policy.encode(frame), state, 2.0, HERE, semantic))
     if "language" in request.parts:
         tasks["language"] = language(workload, artifacts, request.threads)
     return tasks

@@ -38,13 +38,15 @@ class Load:
         """From a message; raises ValueError on fields that are missing or not known."""
         if set(content) != {"model", "cache", "threads", "parts", "options"}:
             raise ValueError(f"load: unexpected fields {sorted(content)}")
-        return cls(
-            str(content["model"]),
-            Path(content["cache"]),
-            int(content["threads"]),
-            tuple(content["parts"]),
-            dict(content["options"]),
-        )
+        return cls(**{**content, "cache": Path(content["cache"]), "parts": tuple(content["parts"])})
+
+    def of(self, part: str) -> dict[str, str]:
+        """The options of one part, without their prefix."""
+        return {key.partition(".")[2]: v for key, v in self.options.items() if key.startswith(part + ".")}
+
+    def folder(self, runtime: str, part: str) -> Path:
+        """Where `models.prepare` has put a runtime's model of a part, in the form that the options name."""
+        return self.cache / self.model / runtime / f"{part}-{self.options[part + '.form']}"
 
 
 def timed_ms(call: Callable[[], object]) -> float:
@@ -54,19 +56,9 @@ def timed_ms(call: Callable[[], object]) -> float:
     return (time.monotonic_ns() - started_ns) / 1e6
 
 
-def encoder_task(encode: Callable[[], object]) -> Task:
-    """One frame through the encoder."""
-    return lambda: {"encoder_ms": timed_ms(encode)}
-
-
-def action_task(act: Callable[[], object]) -> Task:
-    """One step of the action expert."""
-    return lambda: {"action_ms": timed_ms(act)}
-
-
-def tick_task(tick: Callable[[], object]) -> Task:
-    """Encoder and action expert, one after the other."""
-    return lambda: {"tick_ms": timed_ms(tick)}
+def timed_task(metric: str, call: Callable[[], object]) -> Task:
+    """One call, e.g. a frame through the encoder (`encoder_ms`)."""
+    return lambda: {metric: timed_ms(call)}
 
 
 def language_task(prefill: Callable[[], int], step: Callable[[int], int], steps: int) -> Task:
@@ -84,11 +76,6 @@ def language_task(prefill: Callable[[], int], step: Callable[[int], int], steps:
     return run
 
 
-def versions(packages: Sequence[str]) -> dict[str, str]:
-    """Installed versions of packages."""
-    return {name: importlib.metadata.version(name) for name in packages}
-
-
 def serve(load: Callable[[Load], Mapping[str, Task]], packages: Sequence[str]) -> int:
     """Answer requests until the end; a failure is answered in one line and ends the worker with code 1."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
@@ -101,16 +88,17 @@ def serve(load: Callable[[Load], Mapping[str, Task]], packages: Sequence[str]) -
         try:
             if "load" in request:
                 tasks = load(Load.from_dict(request["load"]))
-                answer: dict[str, Any] = {"tasks": sorted(tasks), "versions": versions(packages)}
+                versions = {name: importlib.metadata.version(name) for name in packages}
+                answer: dict[str, Any] = {"ok": True, "tasks": sorted(tasks), "versions": versions}
             else:
-                answer = _run(tasks[request["run"]], int(request["calls"]))
+                answer = {"ok": True, **_run(tasks[request["run"]], int(request["calls"]))}
         except Exception as error:  # noqa: BLE001 - a runtime may raise anything; the parent reports it and goes on
             first = (str(error).strip().splitlines() or [""])[0]
-            answers.write(json.dumps({"ok": False, "error": f"{type(error).__name__}: {first}"}) + "\n")
-            answers.flush()
-            return 1
-        answers.write(json.dumps({"ok": True, **answer}) + "\n")
+            answer = {"ok": False, "error": f"{type(error).__name__}: {first}"}
+        answers.write(json.dumps(answer) + "\n")
         answers.flush()
+        if not answer["ok"]:
+            return 1
     return 0
 
 

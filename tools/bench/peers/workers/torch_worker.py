@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from transformers import DynamicCache, Qwen2ForCausalLM
 
-from tools.bench.peers.models.unsplit import load_action, load_vision
-from tools.bench.peers.workers.serve import Load, Task, action_task, encoder_task, language_task, serve, tick_task
+from tools.bench.peers.models.reference import load_action, load_vision
+from tools.bench.peers.workers.serve import Load, Task, language_task, serve, timed_task
 from tools.bench.peers.workload import DECODE_STEPS, Workload
 
 FORMS = ("fp32", "bf16", "int8")
@@ -70,23 +70,20 @@ def load(request: Load) -> Mapping[str, Task]:
                 tokens: Tensor = vision(frame)
             return tokens
 
-        tasks["encoder"] = encoder_task(encode)
+        tasks["encoder"] = timed_task("encoder_ms", encode)
     if "action" in request.parts:
         action = in_form(load_action(workload.config, reference), form["action"])
         kind = torch.bfloat16 if form["action"] == "bf16" else torch.float32
-        given = (workload.state(), workload.latency(), workload.last_layer_kv())
-        rest = [torch.from_numpy(x).to(kind) for x in given]
-        shape = (1, workload.config.vision.tokens, workload.config.vision.token_dim)
-        visual = torch.from_numpy(np.random.default_rng(2).standard_normal(shape)).to(kind)
+        visual, *rest = (torch.from_numpy(x).to(kind) for x in workload.action_inputs().values())
 
         def act(tokens: Tensor) -> Tensor:
             with torch.inference_mode():
                 trajectory: Tensor = action(tokens, *rest)
             return trajectory
 
-        tasks["action"] = action_task(lambda: act(visual))
+        tasks["action"] = timed_task("action_ms", lambda: act(visual))
         if "encoder" in request.parts:
-            tasks["tick"] = tick_task(lambda: act(encode().to(kind)))
+            tasks["tick"] = timed_task("tick_ms", lambda: act(encode().to(kind)))
     if "language" in request.parts:
         decoder = Decoder(request, form["language"])
         ids = workload.text_ids(workload.prompt_tokens)[None]

@@ -1,1 +1,0 @@
-"""Network shim: reproducible loss, delay, duplication, reordering, partition and rate limits on any link."""

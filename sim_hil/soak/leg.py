@@ -1,0 +1,350 @@
+"""One leg of a soak: one stack in one scene, consecutive tasks without a restart, faults, and a sample every second.
+
+A runner that ends (permanent stop or killed process) is counted and restarted with its bridge. A stuck robot ends the
+leg. All events are written to the leg's folder at once, so that a killed soak loses nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from math import hypot
+from pathlib import Path
+from typing import Any, Final, TextIO
+
+import psutil
+
+from edge.run.say import SayError, say
+from sim_hil.realtime.children import StepError
+from sim_hil.realtime.stack import Stack, StackOptions
+from sim_hil.realtime.truth import TruthTail
+from sim_hil.soak.faults import FaultMenu, FaultSchedule, Injector
+from sim_hil.soak.tasks import Journey, SoakTask, TaskRun
+
+SAMPLE_NS: Final = 1_000_000_000
+POLL_S: Final = 0.05
+ARM_TIMEOUT_S: Final = 90.0
+RETRY_NS: Final = 1_000_000_000
+"""Pause before an instruction is sent again."""
+FAULT_AFTER_NS: Final = 3_000_000_000
+"""A stop within this time after a fault's end or a contact is attributed to it."""
+STUCK_LIVES: Final = 3
+"""Number of consecutive runners that end within STUCK_M of each other for the robot to count as stuck."""
+STUCK_M: Final = 0.5
+CONTACT: Final = "contact"
+CONTACT_STOPS: Final = frozenset(("odometry-stays-frozen", "odometry-speed-mismatch", "tipped-over"))
+"""Faults that stop a robot after a contact."""
+SAMPLES, EVENTS, LEG = "samples.jsonl", "events.jsonl", "leg.json"
+
+
+class _StoppedError(Exception):
+    """The user requested the end."""
+
+
+@dataclass(frozen=True)
+class LegOptions:
+    """Options of a leg: its number from 1, its stack and its duration."""
+
+    number: int
+    seed: int
+    duration_s: float
+    speed_mps: float
+    stack: StackOptions
+
+
+class Leg:
+    """One leg; `show_status` gets a status line every second."""
+
+    def __init__(
+        self,
+        options: LegOptions,
+        journey: Journey,
+        menu: FaultMenu | None,
+        *,
+        stopped: Callable[[], bool],
+        show_status: Callable[[str], None],
+    ) -> None:
+        self.options = options
+        self._journey = journey
+        self._menu = menu
+        self._stopped = stopped
+        self._show_status = show_status
+        self._stack = Stack(options.stack)
+        self._truth = TruthTail(self._stack.trace)
+        self._sampler = ProcessSampler()
+        self._injector: Injector | None = None
+        self._task: TaskRun | None = None
+        self._touched_ns = 0
+        self._begin_ns = 0
+        self._driven_ns: int | None = None
+        self._sampled_ns = 0
+        self._armed = False
+        self._lives: list[tuple[float, float]] = []
+        self.tasks = self.reached = self.stops = 0
+
+    def run(self) -> str:
+        """Run the leg; return why it ended: duration, stopped, stuck, no-task.
+
+        Raises StepError, OSError or FaultError.
+        """
+        folder = self.options.stack.folder
+        stack = asdict(self.options.stack)
+        about = {
+            **asdict(self.options),
+            "stack": {**stack, "folder": folder.name, "artifacts": str(stack["artifacts"])},
+        }
+        (folder / LEG).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+        events, samples = (folder / name for name in (EVENTS, SAMPLES))
+        with events.open("a") as self._events, samples.open("a") as self._samples, self._stack:
+            self._begin_ns = time.monotonic_ns()
+            self._note("leg_begin", scene=self.options.stack.scene, people=self.options.stack.people)
+            if self._menu is not None:
+                schedule = FaultSchedule(self._menu, self.options.seed, self.options.number)
+                self._injector = Injector(self._stack, schedule, self._note)
+            try:
+                self._stack.start_robot(self._wait)
+                why = self._lives_of_runners()
+            except _StoppedError:
+                why = "stopped"
+            self._end_task("cut")
+            if self._stack.runner is not None:
+                code = self._stack.end("runner")
+                self._note("life_end", run=self._stack.runs, code=code, cause="leg", explained="leg")
+            self._stack.end("bridge")
+            self._stack.end("robot")
+            self._note("leg_end", why=why)
+        return why
+
+    def _lives_of_runners(self) -> str:
+        while True:
+            task = self._next_task()
+            if task is None:
+                return "no-task"
+            self._stack.start_bridge(self._wait)
+            self._stack.start_runner(task.instruction)
+            self._note("life_begin", run=self._stack.runs)
+            self._await_arming()
+            if self._armed:
+                self._begin_task(task)
+            why = self._drive() if self._armed else None
+            if why is not None:
+                return why
+            if self._life_over():
+                return "stuck"
+
+    def _await_arming(self) -> None:
+        runner = self._stack.runner
+        assert runner is not None
+        deadline_ns = time.monotonic_ns() + round(ARM_TIMEOUT_S * 1e9)
+        while runner.running and not self._stack.armed():
+            if time.monotonic_ns() > deadline_ns:
+                raise runner.failure(f"not armed within {ARM_TIMEOUT_S:g} s")
+            self._wait()
+            time.sleep(POLL_S)
+        self._armed = self._stack.armed()
+        if self._armed:
+            self._driven_ns = self._driven_ns or time.monotonic_ns()
+            self._note("armed", run=self._stack.runs)
+
+    def _drive(self) -> str | None:
+        """Drive until the runner or the bridge ends (returns None) or the leg ends (returns why)."""
+        runner, bridge = self._stack.runner, self._stack.bridge
+        assert runner is not None and bridge is not None
+        pending: SoakTask | None = None
+        send_ns = 0
+        while runner.running and bridge.running:
+            self._wait()
+            end = self._read_truth()
+            now_ns = time.monotonic_ns()
+            if self._injector is not None:
+                self._injector.step(now_ns)
+            if self.left_s(now_ns) <= 0:
+                return "duration"
+            if end is not None:
+                self._end_task(end)
+                pending, send_ns = self._next_task(), now_ns
+                if pending is None:
+                    return "no-task"
+            if pending is not None and now_ns >= send_ns:
+                if self._send_instruction(pending):
+                    self._begin_task(pending)
+                    pending = None
+                send_ns = time.monotonic_ns() + RETRY_NS  # a runner too busy to answer keeps driving
+            time.sleep(POLL_S)
+        return None
+
+    def _send_instruction(self, task: SoakTask) -> bool:
+        try:
+            say(self._stack.instructions, task.instruction)
+        except (SayError, OSError) as error:
+            # If the runner is ending, the check of its process finds out why.
+            self._note("not_told", why=str(error))
+            return False
+        return True
+
+    def _life_over(self) -> bool:
+        """Record a runner that ended by itself; return whether the robot is stuck."""
+        self._read_truth()
+        explained = self._explanation()
+        during = None if self._injector is None else self._injector.active
+        self._end_task("stopped")
+        bridge = self._stack.bridge
+        bridge_died = bridge is not None and not bridge.running
+        code = self._stack.end("runner")  # takes a little longer if the bridge was killed
+        self._stack.end("bridge")
+        cause, raised = _end_of_run(self._stack.result(f"edge-run-{self._stack.runs}"))
+        if explained == CONTACT and not raised & CONTACT_STOPS:
+            explained = ""
+        about = {"cause": cause, "explained": explained, "during": during, "bridge_died": bridge_died}
+        self._note("life_end", run=self._stack.runs, code=code, **about)
+        self.stops += 1
+        if self._injector is not None:
+            self._injector.clear()
+        self._armed = False
+        pose = self._truth.newest
+        assert pose is not None
+        self._lives.append((pose.x_m, pose.y_m))
+        last = self._lives[-STUCK_LIVES:]
+        return len(last) == STUCK_LIVES and all(hypot(x - last[-1][0], y - last[-1][1]) < STUCK_M for x, y in last)
+
+    def _explanation(self) -> str:
+        """Return the cause of a stop: a fault that should end the run, a contact, or "" if unexplained."""
+        now_ns, injector = time.monotonic_ns(), self._injector
+        newest = None if injector is None else injector.newest
+        stops = newest is not None and newest.fault.expect == "stop"
+        if injector is not None and newest is not None and stops and now_ns - injector.newest_ns < FAULT_AFTER_NS:
+            return newest.fault.name
+        return CONTACT if now_ns - self._touched_ns < FAULT_AFTER_NS else ""
+
+    def _next_task(self) -> SoakTask | None:
+        while self._truth.newest is None:
+            self._read_truth()
+            self._wait()
+            time.sleep(POLL_S)
+        self._read_truth()
+        pose = self._truth.newest
+        return self._journey.next((pose.x_m, pose.y_m, pose.theta_rad))
+
+    def _begin_task(self, task: SoakTask) -> None:
+        self._task = TaskRun(task, time.monotonic_ns())
+        self._note("task_begin", task=asdict(task), run=self._stack.runs)
+
+    def _end_task(self, end: str) -> None:
+        if self._task is None:
+            return
+        outcome = self._task.outcome(end)
+        self._task = None
+        self._note("task_end", **outcome)
+        if end != "cut":
+            self.tasks += 1
+            self.reached += outcome["success"]
+
+    def _read_truth(self) -> str | None:
+        """Read the new ground truth; return why the task is over, None if it is not."""
+        end: str | None = None
+        for pose in self._truth.update():
+            if pose.touching:
+                self._touched_ns = pose.t_ns
+            if self._task is not None and end is None:
+                end = self._task.add(pose)
+        return end
+
+    def _wait(self) -> None:
+        """Check for a requested end and for the health of the robot's side, and take a sample when due."""
+        if self._stopped():
+            raise _StoppedError
+        robot = self._stack.robot
+        if robot is not None and not robot.running:
+            raise StepError(f"the robot's side ended with exit code {robot.process.returncode}, see {robot.log}")
+        now_ns = time.monotonic_ns()
+        if now_ns - self._sampled_ns >= SAMPLE_NS:
+            self._sampled_ns = max(self._sampled_ns + SAMPLE_NS, now_ns - SAMPLE_NS // 2)
+            self._sample(now_ns)
+
+    def _sample(self, now_ns: int) -> None:
+        if self._task is None:  # otherwise _drive reads the ground truth
+            self._read_truth()
+        pose = self._truth.newest
+        sample: dict[str, Any] = {
+            "t_ns": now_ns,
+            "elapsed_s": round((now_ns - self._begin_ns) / 1e9, 3),
+            "run": self._stack.runs,
+            "armed": self._armed,
+            "task": None if self._task is None else self._task.task.number,
+            "fault": None if self._injector is None else self._injector.active,
+            "pose": None if pose is None else [pose.x_m, pose.y_m, pose.theta_rad],
+            "processes": self._sampler.sample(self._stack.processes()),
+        }
+        _append(self._samples, sample)
+        self._show_status(
+            f"leg {self.options.number}, {max(0.0, self.left_s(now_ns)):.0f} s left · "
+            f"{self.reached} of {self.tasks} tasks reached · {self.stops} stops"
+            + (f" · {sample['fault']}" if sample["fault"] else "")
+        )
+
+    def left_s(self, now_ns: int) -> float:
+        """Return the remaining time, s; a leg's time begins when its first runner drives."""
+        begun_ns = now_ns if self._driven_ns is None else self._driven_ns
+        return self.options.duration_s - (now_ns - begun_ns) / 1e9
+
+    def _note(self, kind: str, **fields: Any) -> None:
+        _append(self._events, {"t_ns": time.monotonic_ns(), "kind": kind, **fields})
+
+
+def _end_of_run(result: Path) -> tuple[str, set[str]]:
+    """Return the runner's own reason for its end and all faults that it raised; empty if it was killed."""
+    try:
+        content = json.loads(result.read_text(encoding="utf-8"))
+        faults, raised = content["faults"], set(content["control"]["faults"])
+    except (OSError, ValueError, KeyError):
+        return "", set()
+    return (str(faults[0]) if faults else ""), raised
+
+
+def _append(file: TextIO, content: dict[str, Any]) -> None:
+    """Append one JSON line; flushed, so that the file stays complete if the process is killed."""
+    file.write(json.dumps(content) + "\n")
+    file.flush()
+
+
+PSS_EVERY: Final = 10
+"""Samples between two readings of PSS, which takes milliseconds because the kernel sums it page by page."""
+
+
+class ProcessSampler:
+    """Sampler of processes by name; ended processes are left out."""
+
+    def __init__(self) -> None:
+        self._known: dict[int, psutil.Process] = {}
+        self._count = 0
+
+    def sample(self, pids: Mapping[str, int]) -> dict[str, dict[str, Any]]:
+        """Return by name: pid, cpu_percent since the last sample, rss_bytes, fds, threads, sometimes pss_bytes."""
+        self._count += 1
+        found: dict[str, dict[str, Any]] = {}
+        for name, pid in pids.items():
+            with suppress(psutil.Error):
+                found[name] = self._one(pid)
+        self._known = {pid: process for pid, process in self._known.items() if pid in pids.values()}
+        return found
+
+    def _one(self, pid: int) -> dict[str, Any]:
+        process = self._known.get(pid)
+        if process is None:
+            process = self._known[pid] = psutil.Process(pid)
+            process.cpu_percent()  # the first call only sets the reference
+        with process.oneshot():
+            values: dict[str, Any] = {
+                "pid": pid,
+                "cpu_percent": process.cpu_percent(),
+                "rss_bytes": process.memory_info().rss,
+                "fds": process.num_fds(),
+                "threads": process.num_threads(),
+            }
+        if self._count % PSS_EVERY == 1:
+            with suppress(psutil.Error):
+                values["pss_bytes"] = process.memory_full_info().pss
+        return values

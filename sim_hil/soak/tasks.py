@@ -1,0 +1,141 @@
+"""Tasks of a soak: drawn from the robot's pose to a landmark of the scene, and tracked by ground truth. Seeded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from math import hypot
+from typing import Any, Final
+
+import numpy as np
+
+from sim_hil.benchmark.env.metrics import spl
+from sim_hil.benchmark.language.instructions import WordingError, wordings
+from sim_hil.benchmark.language.route import RouteError
+from sim_hil.benchmark.language.tasks import goal_before, goals, make_task, sample_task
+from sim_hil.benchmark.suite.robots import footprint_m
+from sim_hil.realtime.truth import TruePose
+from sim_hil.scene.nav_grid import NavGrid
+from sim_hil.scene.scene import Scene, SceneObject, Vec2, Vec3
+
+THRESHOLD_M: Final = 1.5  # paper, equation 6
+LENGTH_M: Final = (4.0, 40.0)
+LONGEST_S: Final = 60.0
+"""Longest task at full speed, s: a slow robot gets shorter routes, so that a leg contains several tasks."""
+TRIES: Final = 24
+_SLOW: Final = 0.6  # mean speed among people as a share of the speed limit
+
+
+@dataclass(frozen=True)
+class SoakTask:
+    """Task to drive from `start` (x m, y m, heading rad) to `goal_xy` (m); `shortest_m`: shortest feasible path."""
+
+    number: int
+    instruction: str
+    start: Vec3
+    goal_xy: Vec2
+    goal_label: str
+    shortest_m: float
+    timeout_s: float
+
+
+class Journey:
+    """Random sequence of tasks in one scene. Raises ValueError for a scene without free space or landmarks."""
+
+    def __init__(self, scene: Scene, seed: int, leg: int, speed_mps: float) -> None:
+        self.scene = scene
+        self._rng = np.random.default_rng((seed, 62, leg))
+        self._grid = NavGrid(scene, clearance_m=footprint_m("go2"))
+        self._speed_mps = speed_mps
+        self._length_m = (LENGTH_M[0], min(LENGTH_M[1], max(2 * LENGTH_M[0], LONGEST_S * speed_mps)))
+        self._count = 0
+
+    def begin(self) -> Vec3:
+        """Return a start pose for a leg from which a task exists. Raises ValueError."""
+        for _ in range(TRIES):
+            try:
+                return sample_task(self.scene, self._grid, self._rng, length_m=self._length_m).start
+            except RouteError:
+                continue
+        raise ValueError(f"scene {self.scene.name}: no task found in {TRIES} tries; expected one with landmarks")
+
+    def next(self, at: Vec3) -> SoakTask | None:
+        """Return a task from pose `at`; None if no landmark can be reached.
+
+        If no route can be described unambiguously (such as from a corner), the instruction is a plain "Go to the ...".
+        """
+        things = goals(self.scene)
+        order = [things[int(index)] for index in self._rng.permutation(len(things))]
+        seed = int(self._rng.integers(2**31))
+        for lengths_m in (self._length_m, LENGTH_M):
+            for thing in order:
+                try:
+                    task = make_task(self.scene, self._grid, at, thing)
+                    length_m = _length_m(task.path)
+                    if lengths_m[0] <= length_m <= lengths_m[1]:
+                        return self._task(
+                            at, task.goal, thing, length_m, wordings(task.told, 1, seed, held_out=True)[0]
+                        )
+                except (RouteError, WordingError):
+                    continue
+        for thing in order:
+            goal = goal_before(self._grid, thing)
+            path = None if goal is None else self._grid.path((at[0], at[1]), goal)
+            if goal is not None and path is not None and _length_m(tuple(path)) >= LENGTH_M[0]:
+                return self._task(at, goal, thing, _length_m(tuple(path)), f"Go to the {thing.landmark}.")
+        return None
+
+    def _task(self, at: Vec3, goal: Vec2, thing: SceneObject, length_m: float, text: str) -> SoakTask:
+        self._count += 1
+        timeout_s = 20.0 + length_m / (_SLOW * self._speed_mps)
+        return SoakTask(self._count, text, at, goal, thing.label, length_m, timeout_s)
+
+
+def _length_m(path: tuple[Vec2, ...]) -> float:
+    return sum(hypot(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(path))
+
+
+class TaskRun:
+    """Tracker of one task's poses from `started_ns` on."""
+
+    def __init__(self, task: SoakTask, started_ns: int) -> None:
+        self.task = task
+        self.started_ns = started_ns
+        self._last: TruePose | None = None
+        self._ne_m = hypot(task.goal_xy[0] - task.start[0], task.goal_xy[1] - task.start[1])
+        self._path_m = 0.0
+        self._touched: set[str] = set()
+
+    def add(self, pose: TruePose) -> str | None:
+        """Add a pose; return "reached" or "timeout" if it ends the task, else None."""
+        if pose.t_ns < self.started_ns:
+            return None
+        if self._last is not None:
+            self._path_m += hypot(pose.x_m - self._last.x_m, pose.y_m - self._last.y_m)
+        self._last = pose
+        self._touched.update(pose.touching)
+        self._ne_m = hypot(self.task.goal_xy[0] - pose.x_m, self.task.goal_xy[1] - pose.y_m)
+        if self._ne_m < THRESHOLD_M:
+            return "reached"
+        return "timeout" if (pose.t_ns - self.started_ns) / 1e9 >= self.task.timeout_s else None
+
+    def outcome(self, end: str) -> dict[str, Any]:
+        """Return the outcome so far as JSON values.
+
+        `end`: reached, timeout, stopped (the runner ended) or cut (the leg ended); `spl` in percent.
+        """
+        reached, task = end == "reached", self.task
+        last_ns = self.started_ns if self._last is None else self._last.t_ns
+        return {
+            "number": task.number,
+            "end": end,
+            "success": reached,
+            "ne_m": round(self._ne_m, 3),
+            "spl": round(100 * spl(reached, task.shortest_m, self._path_m), 2),
+            "path_m": round(self._path_m, 3),
+            "shortest_m": round(task.shortest_m, 3),
+            "time_s": round((last_ns - self.started_ns) / 1e9, 3),
+            "collisions": sorted(self._touched),
+            "goal": task.goal_label,
+            "instruction": task.instruction,
+        }

@@ -1,1 +1,0 @@
-"""Measures of a soak, and their judgement against a budget."""

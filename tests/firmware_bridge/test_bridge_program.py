@@ -1,0 +1,101 @@
+"""The bridge as a program: how large it is, what it imports, its watchdog, its local input, and commands without it."""
+
+from __future__ import annotations
+
+import ast
+import io
+import subprocess
+import sys
+import tokenize
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from firmware_bridge.bridge import Bridge, is_pressed
+from firmware_bridge.bridge import main as bridge_main
+from firmware_bridge.client import BridgeClient, BridgeUnavailable
+from firmware_bridge.core.link import BridgeStatus
+from tests.support.processes import GO2_SIM, REPOSITORY
+
+
+def test_a_frozen_bridge_does_not_feed_the_watchdog() -> None:
+    pings: list[int] = []
+    shell = Bridge.__new__(Bridge)
+    shell._reported, shell._ready = "armed: driving", True
+    shell._notifier = SimpleNamespace(watchdog_period_ns=100, watchdog=lambda: pings.append(1))  # type: ignore
+    shell._pinged_ns, shell._wake_ns = 0, 10**9
+    status = BridgeStatus(10**9 + 60_000_000, "armed", "driving", 0, 0, 0, (0.0, 0.0, 0.0), False)
+    shell._report_progress(status)
+    assert pings == []
+    shell._wake_ns = status.stamp_ns
+    shell._report_progress(status)
+    assert pings == [1]
+
+
+@pytest.mark.parametrize(("content", "pressed"), [(b"0\n", False), (b"1\n", True), (b"", True), (b"junk", True)])
+def test_a_local_emergency_stop_is_pressed_unless_its_file_reads_zero(
+    tmp_path: Path, content: bytes, pressed: bool
+) -> None:
+    path = tmp_path / "value"
+    path.write_bytes(content)
+    assert is_pressed(path) is pressed
+    assert is_pressed(tmp_path / "missing") and is_pressed(tmp_path)
+
+
+def test_the_bridge_imports_neither_numpy_nor_anything_that_learns() -> None:
+    code = (
+        "import firmware_bridge.bridge, sys; print(sorted({'numpy', 'torch', 'onnxruntime', 'cv2'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+WIRE_TABLES = {"idl.py", "idl_low.py", "ids.py"}
+
+
+READS_THE_ROBOT_FILE = {"config.py"}
+
+
+# 1,000 before the latch, permissions, publisher counts, late interface, socket groups and safe outputs: 500 lines more.
+MOST_LINES = 1550
+
+
+@pytest.mark.slow
+def test_the_bridge_process_stays_small_enough_to_be_read_in_an_afternoon() -> None:
+    """All of ours that it imports, but for the wire's tables and the reading of the robot file before it starts."""
+    ours = "[m.__file__ for name, m in sys.modules.items() if name.startswith('firmware_bridge')]"
+    code = f"import firmware_bridge.bridge, sys; print(*{ours})"
+    done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    sizes = {path.name: lines_of_code(path.read_text()) for path in map(Path, done.stdout.split())}
+    read_by_people = {name: size for name, size in sizes.items() if name not in WIRE_TABLES | READS_THE_ROBOT_FILE}
+    assert sum(read_by_people.values()) < MOST_LINES, read_by_people
+
+
+def lines_of_code(source: str) -> int:
+    """Lines that hold code: no blank lines, comments, documentation strings or imports."""
+    left_out = set()
+    for node in ast.walk(ast.parse(source)):
+        says = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        if says or isinstance(node, (ast.Import, ast.ImportFrom)):
+            left_out |= set(range(node.lineno, (node.end_lineno or 0) + 1))  # type: ignore[attr-defined]
+    skipped = (tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER)
+    code = set()
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type not in skipped:
+            code |= set(range(token.start[0], token.end[0] + 1))
+    return len(code - left_out)
+
+
+def test_without_a_bridge_the_client_says_what_to_do(tmp_path: Path) -> None:
+    with pytest.raises(BridgeUnavailable, match="start `edge-bridge"):
+        BridgeClient(tmp_path / "bridge.sock")
+
+
+@pytest.mark.parametrize("command", ["stop", "arm", "status"])
+def test_an_operators_command_without_a_bridge_is_refused_in_one_line(
+    tmp_path: Path, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert bridge_main([command, "--robot", str(GO2_SIM), "--socket", str(tmp_path / "bridge.sock")]) == 3
+    error = capsys.readouterr().err
+    assert "no bridge listens" in error and error.count("\n") == 1
