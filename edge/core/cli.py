@@ -96,9 +96,9 @@ def named_file(path: Path) -> Iterator[Path]:
 
 
 def write_whole(path: Path, text: str | bytes) -> None:
-    """Write a file in one rename, so that a file that is there is whole; raises OSError and leaves nothing.
+    """Write a file in one rename, so that no reader sees a part of it. Raises OSError and leaves no file then.
 
-    A device or a FIFO is written to as it is, a symbolic link leads to the file that is replaced.
+    A device or a FIFO is written in place. Of a symbolic link, the target file is replaced.
     """
     write_output(path, text.encode() if isinstance(text, str) else text)
 

@@ -30,7 +30,7 @@ NO_BATTERY: Final = ("battery_low", "no battery report")
 
 
 class DangerWatch:
-    """Remembers the newest reports and finds what forbids motion now."""
+    """The robot's newest reports and the dangers in them that forbid motion now."""
 
     def __init__(self, safety: SafetyConfig, state_timeout_ns: int) -> None:
         self.robot: RobotState | None = None

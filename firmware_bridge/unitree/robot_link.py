@@ -68,7 +68,7 @@ class RobotLink:
         return Report(state, in_use, estop, foreign, denied, publishers, battery_percent, version, failing)
 
     def write(self, request: Move | Call) -> None:
-        """Send one request and wait for nothing; what the network does not take is counted."""
+        """Send one request without waiting. A request that the network does not accept is counted."""
         if isinstance(request, Move):
             parameter = move_parameter(request.vx_mps, request.vy_mps, request.wz_radps)
             self._sport.send(ids.MOVE, parameter, noreply=True)
