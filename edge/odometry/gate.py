@@ -302,7 +302,7 @@ class StillCheck:
         return False
 
     def take_rate(self) -> tuple[float, float] | None:
-        """Return the mean yaw rate at rest, rad/s, and its duration, s, once long enough; each interval counts once."""
+        """Return mean yaw rate at rest (rad/s) and duration (s) once it is long enough. Each mean is returned once."""
         if self._seconds * 1e9 < STILL_NS:
             return None
         taken = (self._turned_rad / self._seconds, self._seconds)

@@ -39,7 +39,7 @@ class Anchor:
 
     @classmethod
     def now(cls, newest_ns: int) -> Anchor:
-        """Plan with the frame that is newest now."""
+        """Return an anchor whose newest frame is already captured."""
         return cls(newest_ns, newest_ns, 0)
 
     def older_ns(self, offset_s: float) -> int:

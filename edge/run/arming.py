@@ -32,23 +32,23 @@ class StoppedEarlyError(RuntimeError):
 
 
 class Bridge(Protocol):
-    """The part of a `BridgeClient` that arming uses."""
+    """The methods of `BridgeClient` that arming uses."""
 
     def arm(self) -> bool:
-        """Request that the bridge stands the robot up and takes commands."""
+        """Send the bridge a request to stand the robot up and to accept commands."""
 
     def send_velocity(self, seq: int, stamp_ns: int, vx_mps: float, vy_mps: float, wz_radps: float) -> bool:
-        """One command."""
+        """Send one velocity command; returns whether it was sent."""
 
     def poll(self) -> BridgeStatus | None:
         """Newest status; raises BridgeUnavailable."""
 
 
 class StoppableBridge(Protocol):
-    """The part of a `BridgeClient` that stopping uses."""
+    """The methods of `BridgeClient` that stopping uses."""
 
     def stop(self) -> bool:
-        """Request that the bridge stops the robot."""
+        """Send the bridge a request to stop the robot."""
 
     def poll(self) -> BridgeStatus | None:
         """Newest status; raises BridgeUnavailable."""
