@@ -1,4 +1,4 @@
-"""`edge-calib latency`: how long generations take on this device beside a control thread; writes a latency profile."""
+"""`edge-calib latency`: measures generation times beside a control thread; writes a latency profile."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from edge.reasoning.prompt import InstructionError, check_instruction
 from export.evaluation.calibration import CalibrationError, load_calibration
 
 LEAST: Final = 20
-"""Generations that a profile is made of at least: fewer show too little of the slow ones."""
+"""Smallest number of generations of a profile: fewer contain too few slow ones."""
 INSTRUCTION: Final = "walk down the corridor and stop at the vending machine"
 
 EXAMPLES: Final = """examples:

@@ -1,4 +1,4 @@
-"""The reasoning thread of a run, as it is on a robot, beside ticks that encode and act; no robot is needed."""
+"""Runs the runner's reasoning thread beside ticks that encode and act, without a robot."""
 
 from __future__ import annotations
 
@@ -28,41 +28,41 @@ from edge.state.semantic import SemanticSlot, SharedState
 from export.evaluation.calibration import Clip
 
 WARM: Final = 3
-"""Generations that are left out: what they wait for is not known before there were some."""
+"""First generations that are left out: their waits depend on earlier durations."""
 SAY_EVERY_S: Final = 15.0
 POLL_S: Final = 0.05
 JOIN_S: Final = 5.0
 
 
 class MeasureError(RuntimeError):
-    """A measurement that cannot be used; one line."""
+    """An unusable measurement; one line."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What was measured: (time of a generation, how late its newest frame was captured) in s, and the ticks beside."""
+    """Measurement: (generation time, time from its start to its newest frame), s, and the ticks beside it."""
 
     times_s: tuple[tuple[float, float], ...]
     ticks: int
     late: int
-    """Ticks that were not over by the next one's deadline."""
+    """Number of ticks that ended after the next one's deadline."""
     failed: int
 
 
 @dataclass
 class Generations:
-    """Takes the records of generations, as a flight log would."""
+    """Collects the records of generations in place of a flight log."""
 
     times_s: list[tuple[float, float]] = field(default_factory=list)
 
     def put(self, topic: str, _stamp_ns: int, record: Mapping[str, Any]) -> None:
-        """Keep the times of a finished generation."""
+        """Store the times of a finished generation."""
         if topic == "/semantic":
             self.times_s.append(times_of(record))
 
 
 class Ticks:
-    """The control thread's work at its rate: a picture encoded into the ring, the action expert asked."""
+    """The control thread's work at its rate: encode a picture into the ring, run the action expert."""
 
     def __init__(
         self, artifacts: Artifacts, policy: Policy, ring: TokenRing, slot: SemanticSlot, clip: Clip, schedule: Schedule
@@ -75,7 +75,7 @@ class Ticks:
         self.error = ""
 
     def run(self, stop: threading.Event) -> None:
-        """Until `stop`, on absolute deadlines; those that were slept over are skipped."""
+        """Tick until `stop` on absolute deadlines; skip missed ones."""
         enter(self._schedule.control)
         deadline_ns = time.monotonic_ns() + self._period_ns
         try:
@@ -92,7 +92,7 @@ class Ticks:
 
     def _tick(self) -> None:
         now_ns = time.monotonic_ns()
-        # The clip's pictures are about a second apart; each is shown for as long.
+        # The clip's pictures are about a second apart; each stays the input for as long.
         index = (self.ticks * self._period_ns // 1_000_000_000) % len(self._pictures)
         tokens = self._policy.encode(self._pictures[index], self._ring.next_buffer())
         self._ring.put(EncodedFrame(now_ns, self._poses[index], tokens))
@@ -114,7 +114,7 @@ def measure(
     say: Callable[[str], None],
     stop: threading.Event,
 ) -> Measured:
-    """Run both threads until there are so many generations or the time is over; `stop` ends it before.
+    """Run both threads until the number of generations or the time limit is reached, or until `stop`.
 
     Raises ArtifactError, InstructionError, MeasureError.
     """

@@ -50,18 +50,18 @@ TRUTH_INTERVAL_NS = 500_000_000
 MIN_DISTANCE_M = 5.0
 MIN_INTERVALS = 15
 MAX_UNEXPLAINED = 0.15
-"""Largest share of the motion (RMS over the intervals) that may be left unexplained: beyond it no fit is one."""
+"""Largest unexplained share of the motion (RMS over the intervals) of a usable fit."""
 GYRO_NOISE_RADPS_RTHZ = math.radians(0.08)
 STILL_MPS = 0.03
 STILL_RADPS = math.radians(2.0)
 
 
 class LogError(ValueError):
-    """A log that cannot be calibrated from; one line: what is missing, what to do."""
+    """The log does not allow a calibration; one line: what is missing, what to do."""
 
 
 class NoFitError(ValueError):
-    """The fit is not good enough, or led to a calibration that no robot has; one line."""
+    """The fit is not good enough, or its calibration is implausible for any robot; one line."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Drive:
 
 @dataclass(frozen=True)
 class Reference:
-    """Motion over an interval by something better than the odometry; `variance`: m² per axis and rad²."""
+    """Motion over an interval by a source better than the odometry; `variance`: m² per axis and rad²."""
 
     start_ns: int
     end_ns: int
@@ -85,7 +85,7 @@ class Reference:
 
 @dataclass(frozen=True)
 class Fit:
-    """A calibration and how good it is: share of the motion left unexplained, before and after."""
+    """A calibration and its quality: unexplained share of the motion, before and after."""
 
     calibration: OdometryCalibration
     intervals: int
@@ -103,7 +103,7 @@ class Fit:
 
 
 def read_drive(path: Path) -> Drive:
-    """Odometry and pictures of a flight log. Raises LogError, RecordingError or OSError."""
+    """Read odometry and pictures of a flight log. Raises LogError, RecordingError or OSError."""
     reports: list[OdometryInputs] = []
     pictures: list[tuple[int, bytes]] = []
     for topic, stamp_ns, payload in read_messages(path):
@@ -142,7 +142,7 @@ def _report(stamp_ns: int, payload: dict[str, Any]) -> OdometryInputs:
 
 
 def increments(drive: Drive) -> tuple[int, list[Increment]]:
-    """Accepted motion between reports, and where it begins; jumps and garbage are left out as in the runner."""
+    """Return the accepted motion between reports, and its start; reject what the runner rejects."""
     gate = OdometryGate()
     begin_ns: int | None = None
     accepted: list[Increment] = []
@@ -158,7 +158,7 @@ def increments(drive: Drive) -> tuple[int, list[Increment]]:
 
 
 def gyro_bias(drive: Drive, prior: OdometryCalibration) -> tuple[float, float]:
-    """Mean of the gyro while the robot stood, and its standard error, rad/s; the prior's where it never stood."""
+    """Return mean and standard error of the gyro at standstill, rad/s; the prior's without any standstill."""
     rates = [
         report.gyro_wz_radps
         for report in drive.reports
@@ -175,7 +175,7 @@ def gyro_bias(drive: Drive, prior: OdometryCalibration) -> tuple[float, float]:
 
 
 def visual_references(drive: Drive, geometry: CameraGeometry) -> list[Reference]:
-    """Motion by the camera, over the intervals of its own choice."""
+    """Estimate the camera's motion, over the intervals of visual odometry."""
     eye = VisualOdometry(geometry)
     stamps = [report.received_ns for report in drive.reports]
     found: list[Reference] = []
@@ -193,7 +193,7 @@ def visual_references(drive: Drive, geometry: CameraGeometry) -> list[Reference]
 
 
 def truth_references(path: Path, begin_ns: int, end_ns: int) -> list[Reference]:
-    """Motion by a trace of ground truth (`edge-hil --trace`), every half second. Raises LogError or OSError."""
+    """Read the motion of a ground-truth trace (`edge-hil --trace`), every 0.5 s. Raises LogError or OSError."""
     stamps: list[int] = []
     poses: list[SE2] = []
     for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
@@ -291,7 +291,7 @@ def fit(drive: Drive, references: Sequence[Reference], prior: OdometryCalibratio
 def _intervals(
     begin_ns: int, accepted: Sequence[Increment], references: Sequence[Reference], model: OdometryModel
 ) -> Iterator[tuple[Reference, Interval]]:
-    """Every reference with the odometry of its time, where there is some without a gap."""
+    """Pair every reference with its interval's odometry; leave out intervals with a gap."""
     rest = list(accepted)
     for reference in references:
         if reference.start_ns < begin_ns or not rest or reference.end_ns > rest[-1].end_ns:
@@ -306,7 +306,7 @@ def _intervals(
 def _least_squares(
     columns: Array, values: Array, weight: Array, prior: Sequence[float], prior_sigma: Sequence[float]
 ) -> tuple[list[float], list[float]]:
-    """Weighted least squares with a prior on each unknown; estimates and their standard errors."""
+    """Solve weighted least squares with a prior on each unknown; return estimates and standard errors."""
     information = np.diag(1 / np.square(prior_sigma))
     normal = (columns * weight[:, None]).T @ columns + information
     solution = np.linalg.solve(normal, (columns * weight[:, None]).T @ values + information @ np.array(prior))

@@ -13,24 +13,24 @@ from edge.power.governor.plan import STAGES
 
 MIN_R2: Final = 0.9
 MAX_CHECK_ERROR: Final = 0.15
-"""Thresholds of ours: below, the fit predicts too little of what a run will draw."""
+"""Our thresholds: a fit beyond them predicts a run's power too badly."""
 _SWEEPS: Final = 20_000
 
 
 class FitError(ValueError):
-    """Phases from which nothing can be fitted; its text is the one line to show."""
+    """The phases do not determine a fit; the message is one line."""
 
 
 @dataclass(frozen=True)
 class Phase:
-    """What ran during a time, and the energy that the meter gave for it."""
+    """Units of a phase, with its duration and metered energy."""
 
     name: str
     seconds: float
     energy_j: float
     counts: Mapping[str, float]
     check: bool = False
-    """Left out of the fit, to test it: a mixture as in a run."""
+    """Whether the phase only tests the fit: a mixture as in a run."""
 
     def __post_init__(self) -> None:
         if not (self.seconds > 0 and np.isfinite(self.energy_j)):
@@ -47,7 +47,7 @@ class Phase:
 
 @dataclass(frozen=True)
 class Fit:
-    """Idle power and energy above it of one unit of each stage, with standard errors, and how far to trust them."""
+    """Idle power and energy above it of one unit of each stage, with standard errors and quality of the fit."""
 
     idle_w: float
     idle_error_w: float
@@ -59,12 +59,12 @@ class Fit:
     """Largest relative error of the power of a phase that was left out."""
 
     def power_w(self, phase: Phase) -> float:
-        """Power of a phase by the fit, W."""
+        """Return the power of a phase by the fit, W."""
         return self.idle_w + sum(self.stage_j[name] * n for name, n in phase.counts.items()) / phase.seconds
 
     @property
     def weak(self) -> tuple[str, ...]:
-        """Why the fit must not be used; empty when it may."""
+        """Reasons against using the fit; empty when it is usable."""
         reasons = []
         if not self.r2 >= MIN_R2:
             reasons.append(f"the fit explains {self.r2:.2f} of the variation of power, expected {MIN_R2} or more")
@@ -88,7 +88,7 @@ class Fit:
 
 
 def fit_energy(phases: Sequence[Phase]) -> Fit:
-    """Least squares on average power with nothing below zero; raises FitError when phases do not tell stages apart."""
+    """Fit average power by non-negative least squares; raises FitError when the phases do not separate the stages."""
     fitted = [phase for phase in phases if not phase.check]
     design = np.array(
         [[1.0, *(phase.counts.get(name, 0.0) / phase.seconds for name in STAGES)] for phase in fitted]
@@ -98,7 +98,7 @@ def fit_energy(phases: Sequence[Phase]) -> Fit:
     missing = [name for name, norm in zip(("idle", *STAGES), scale, strict=True) if norm == 0]
     if missing or np.linalg.matrix_rank(design / scale) < design.shape[1]:
         what = ", ".join(missing) or "all of them, each in another mixture"
-        raise FitError(f"{len(fitted)} phases do not tell the stages apart: run {what}")
+        raise FitError(f"{len(fitted)} phases do not separate the stages: run {what}")
     solution = non_negative(design / scale, power) / scale
     residual = power - design @ solution
     freedom = max(1, len(fitted) - design.shape[1])

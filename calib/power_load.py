@@ -19,7 +19,7 @@ from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
 from edge.power.governor.plan import STAGES
 from edge.power.meters.meter import MeterError, PowerMeter, PowerSample
-from edge.reasoning.prompt import EXAMPLE_BEFORE, EXAMPLE_WAY
+from edge.reasoning.prompt import EXAMPLE_BEFORE, EXAMPLE_PAST_PATH
 from edge.state.ring import EncodedFrame
 from edge.state.semantic import SemanticState
 
@@ -28,12 +28,12 @@ READ_S: Final = 0.05
 AWAIT_S: Final = 2.0
 LEAST_COVERED: Final = 0.9
 REST_S: Final = 0.5
-"""Between phases, so that one's clocks do not reach into the next."""
+"""Pause between phases, so that raised clocks do not last into the next."""
 
 
 @dataclass
 class Counts:
-    """Units of every stage that have run, in all threads, and what one unit of a prompt is."""
+    """Counts of the units that each stage has run, in all threads."""
 
     done: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
     lock: threading.Lock = field(default_factory=threading.Lock)
@@ -44,7 +44,7 @@ class Counts:
             self.done[stage] += units
 
     def copy(self) -> dict[str, float]:
-        """What has run so far."""
+        """Return the counts so far."""
         with self.lock:
             return dict(self.done)
 
@@ -60,7 +60,7 @@ class EnergyLog:
 
     @contextmanager
     def running(self) -> Iterator[EnergyLog]:
-        """Read in a thread of its own for as long as the block lasts."""
+        """Read in a separate thread during the block."""
         stop = threading.Event()
 
         def read() -> None:
@@ -90,7 +90,7 @@ class EnergyLog:
             time.sleep(READ_S)
 
     def energy_j(self, begin_ns: int, end_ns: int) -> float:
-        """Energy in J; each sample stands for the time since the one before. Raises MeterError for too few samples."""
+        """Return the energy, J; each sample covers the time since the previous one. Raises MeterError for too few."""
         samples = list(self._samples)
         energy, covered = 0.0, 0
         for before, sample in itertools.pairwise(samples):
@@ -109,7 +109,7 @@ class EnergyLog:
 
 
 class Load:
-    """The stages of one artifact directory, ready to be run over and over."""
+    """The stages of one artifact directory, ready for repeated runs."""
 
     def __init__(self, artifacts: Artifacts, counts: Counts) -> None:
         """Open the graphs and run each once. Raises ArtifactError or GraphError."""
@@ -122,7 +122,7 @@ class Load:
         tokens = self._policy.encode(self._image).copy()
         frames = [EncodedFrame(i, here, tokens) for i in range(len(runtime.frame_offsets_s))]
         self._tokens, self._here = tokens, here
-        self._segments = self._language.prompt.build(frames, INSTRUCTION, EXAMPLE_WAY, EXAMPLE_BEFORE)
+        self._segments = self._language.prompt.build(frames, INSTRUCTION, EXAMPLE_PAST_PATH, EXAMPLE_BEFORE)
         generation = self._language.generate(
             self._segments, max_new_tokens=runtime.max_new_tokens, cancelled=lambda: False
         )
@@ -133,7 +133,7 @@ class Load:
         self._act()
 
     def phases(self) -> Mapping[str, tuple[Callable[[float], None], bool]]:
-        """Phases by name: what runs until a time in s of the monotonic clock, and whether it is only a check."""
+        """Return the phases by name: a function that runs until a monotonic time, s, and whether it is only a check."""
         return {
             "idle": (_sleep_until, False),
             "vision_encoder": (self._repeat(self._encode), False),
@@ -182,7 +182,7 @@ class Load:
 
     def _both(self, end_s: float) -> None:
         def reason() -> None:
-            # To the end of a generation: a part of one would be energy that nothing counts.
+            # To the end of a generation: the energy of a part would not be counted.
             while time.monotonic() < end_s:
                 self._generate(self._runtime.max_new_tokens)
                 self._context()
@@ -202,7 +202,7 @@ def _sleep_until(end_s: float) -> None:
 def run_phases(
     load: Load, counts: Counts, log: EnergyLog, *, seconds: float, rounds: int, say: Callable[[str], None]
 ) -> list[Phase]:
-    """Every phase for that long, all of them once a round; raises MeterError when the meter loses too much."""
+    """Run every phase for that long, once a round; raises MeterError when the meter loses too many samples."""
     found: list[Phase] = []
     with log.running():
         for number in range(rounds):

@@ -125,10 +125,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _verify(directory: Path, key_file: Path) -> dict[str, Any]:
     class _Once(Trust):
-        """Checks as a robot would that has never run anything."""
+        """Trust of a robot that has not run any release yet."""
 
         def accept(self, release: int) -> None:
-            """Nothing to remember here."""
+            """Store nothing."""
 
     trust = _Once(key_file, directory / "no-counter" / "release.json")
     return {"release": load_artifacts(directory.absolute(), trust).release, "key_id": trust.key_id}

@@ -1,4 +1,4 @@
-"""How the runner commands: a connection to the bridge that never waits once it is made."""
+"""The runner's connection to the bridge; it never waits once it is connected."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ __all__ = ["BridgeClient", "BridgeStatus", "BridgeUnavailable"]
 _HELLO_TIMEOUT_MS: Final = 1000
 
 
-class BridgeUnavailable(RuntimeError):  # noqa: N818 - a state of the world, named as one
-    """No bridge listens, it has another client, or it has gone; one line for the operator."""
+class BridgeUnavailable(RuntimeError):  # noqa: N818 - it names a state, not an error
+    """No bridge listens, it has another client, or its connection has closed; one line for the operator."""
 
 
 class BridgeClient:
     """The one client of an `edge-bridge`.
 
     Order of use: `arm()`, then `send_velocity` at the control rate from that moment on, zero velocity included, while
-    `poll()` reports "arming" and later "armed". The bridge stops the robot when no good command has come for its
-    deadman time (250 ms), when `stop()` is called, and when this process or its connection goes away; it then needs a
-    new `arm()`. Commands sent while arming keep the deadman quiet but do not move the robot.
+    `poll()` reports "arming" and later "armed". The bridge stops the robot when no good command arrives within its
+    deadman time (250 ms), when `stop()` is called, and when this process or its connection ends; it then needs a new
+    `arm()`. Commands sent while arming satisfy the deadman but do not move the robot.
     """
 
     def __init__(self, socket_path: Path | str) -> None:
@@ -45,7 +45,7 @@ class BridgeClient:
         self._status: BridgeStatus | None = None
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
-            self._socket.settimeout(_HELLO_TIMEOUT_MS / 1e3)  # a bridge that hangs accepts nobody
+            self._socket.settimeout(_HELLO_TIMEOUT_MS / 1e3)  # a bridge that hangs accepts no connection
             self._socket.connect(str(socket_path))
             listener_uid = peer_uid(self._socket)
         except PermissionError as error:
@@ -75,7 +75,7 @@ class BridgeClient:
             raise BridgeUnavailable(f"the bridge at {socket_path} has another client or does not answer")
 
     def arm(self) -> bool:
-        """Ask the bridge to stand the robot up and take commands; follow `poll()`. False when it could not be sent."""
+        """Request arming: the bridge stands the robot up and takes commands. False when it was not sent."""
         return self._send(Arm())
 
     def send_velocity(self, seq: int, stamp_ns: int, vx_mps: float, vy_mps: float, wz_radps: float) -> bool:
@@ -95,7 +95,7 @@ class BridgeClient:
         return self._send(Release())
 
     def poll(self) -> BridgeStatus | None:
-        """Newest status known, None before the first; raises BridgeUnavailable when the bridge has gone."""
+        """Return the newest status, None before the first; raises BridgeUnavailable when the connection has closed."""
         while True:
             try:
                 data = self._socket.recv(MAX_DATAGRAM_BYTES)
@@ -117,6 +117,6 @@ class BridgeClient:
     def _send(self, message: Message) -> bool:
         try:
             self._socket.send(encode(message))
-        except OSError:  # full queue (a hung bridge) or a closed connection: poll() tells which
+        except OSError:  # full queue (a hung bridge) or a closed connection: poll() distinguishes them
             return False
         return True

@@ -1,4 +1,4 @@
-"""The bridge's end of its local sockets: datagrams in, status out, nothing waits."""
+"""The bridge's end of its local sockets: receives datagrams and sends the status without waiting."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class SocketGroups:
     runner: str | None = None
     """May command."""
     operator: str | None = None
-    """May stop, arm and ask. The runner must not be in it: it could take back an emergency stop."""
+    """Group that may stop, arm and read the status. Without the runner, which could end an emergency stop."""
 
     def __post_init__(self) -> None:
         if self.runner is not None and self.runner == self.operator:
@@ -46,14 +46,14 @@ USER_ONLY: Final = SocketGroups()
 
 
 def listen(path: Path, group: str | None = None) -> socket.socket:
-    """Listening socket of mode 0600, or 0660 for a group; replaces a socket file nobody listens at.
+    """Open a listening socket of mode 0600, or 0660 for a group; replace a socket file without a listener.
 
-    Raises SocketTakenError, or ConfigError when something else is in the way or the directory is not usable.
+    Raises SocketTakenError, or ConfigError for another kind of file at the path or an unusable directory.
     """
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
         if path.exists() and not stat.S_ISSOCK(path.stat().st_mode):
-            # Connecting to a plain file is "refused" too, and it must not be taken for a socket left behind.
+            # Connecting to a plain file is "refused" too, but it is not a stale socket.
             raise ConfigError(f"socket {path}: expected a free path, found a file; give another --socket")
         _make_folder(path.parent, shared=group is not None)
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
@@ -81,10 +81,10 @@ def listen(path: Path, group: str | None = None) -> socket.socket:
 
 
 def _make_folder(folder: Path, *, shared: bool) -> None:
-    """Make the sockets' folder; for a shared one others may pass through it, and nobody but this user write."""
+    """Create the sockets' folder. Other users may traverse a shared one; only this user may write."""
     if not shared:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if folder == runtime_dir():  # under /tmp another user may have made it
+        if folder == runtime_dir():  # under /tmp another user may have created it
             check_is_ours(folder)
         return
     if not folder.exists():
@@ -100,7 +100,7 @@ def _make_folder(folder: Path, *, shared: bool) -> None:
 
 
 def _share(path: Path, group: str) -> None:
-    """Let a group connect. Raises ConfigError for one that does not exist or that this process is not in."""
+    """Let a group connect. Raises ConfigError for an unknown group or one without this process's user."""
     try:
         os.chown(path, -1, grp.getgrnam(group).gr_gid)
     except KeyError:
@@ -116,9 +116,9 @@ def _share(path: Path, group: str) -> None:
 
 
 def check_is_ours(folder: Path, option: str = "--socket") -> None:
-    """Raise ConfigError unless `folder` is a directory of this user that nobody else can enter.
+    """Raise ConfigError unless `folder` is a directory of this user that no other user can enter.
 
-    `option`: what gives another place, for the message.
+    `option`: the option that names another place, for the message.
     """
     found = folder.lstat()
     if found.st_uid != os.getuid() or not stat.S_ISDIR(found.st_mode) or found.st_mode & 0o077:
@@ -127,10 +127,10 @@ def check_is_ours(folder: Path, option: str = "--socket") -> None:
 
 
 class ClientLink:
-    """One socket with one client at a time, or a few."""
+    """One listening socket with one client at a time, or a few."""
 
     def __init__(self, path: Path, *, places: int = 1, group: str | None = None) -> None:
-        """`places`: a client beyond one is turned away, a client beyond several replaces the oldest.
+        """`places`: number of clients; a further one is refused at 1, and replaces the oldest above 1.
 
         `group`: users that may connect besides the bridge's own and root.
         """
@@ -153,7 +153,7 @@ class ClientLink:
         return self._clients if self._refusing else [self._listener, *self._clients]
 
     def receive(self) -> list[Message]:
-        """Datagrams that have arrived; notices connections and disconnections. Malformed ones are counted, ignored."""
+        """Return received datagrams and handle connections; malformed datagrams are counted and ignored."""
         messages: list[Message] = []
         present = list(self._clients)
         for client in present:
@@ -162,12 +162,12 @@ class ClientLink:
                     messages.append(decode(data))
                 except LinkError:
                     self.malformed += 1
-        if self._clients == present:  # a reader of `connected` sees a client go before the next connects
+        if self._clients == present:  # a reader of `connected` sees the disconnection before the next client connects
             self._accept()
         return messages
 
     def send_status(self, status: BridgeStatus) -> None:
-        """Send the status when it has changed, and at 10 Hz; dropped when the client does not read."""
+        """Send the status on a change and at 10 Hz; drop it when the client does not read."""
         news = (status.state, status.cause, status.blocked_by)
         if news != self._sent or status.stamp_ns - self._sent_ns >= _STATUS_PERIOD_NS:
             self._sent_ns, self._sent = status.stamp_ns, news
@@ -187,7 +187,7 @@ class ClientLink:
             fresh, _ = self._listener.accept()
         except BlockingIOError:
             return
-        except OSError:  # no descriptor left, or the client has gone again: not to be polled before the next step
+        except OSError:  # no descriptor left, or the client has disconnected: do not poll before the next step
             self._refusing = True
             return
         if len(self._clients) >= self._places > 1:
@@ -197,12 +197,12 @@ class ClientLink:
             self._clients.append(fresh)
             self._sent = ()
         else:
-            fresh.close()  # without a greeting: its BridgeClient knows what that means
+            fresh.close()  # without a greeting: its BridgeClient reports another client
 
     def _datagrams(self, client: socket.socket) -> Iterator[bytes]:
         for _ in range(_MAX_DATAGRAMS_A_STEP):
             try:
-                data = client.recv(MAX_DATAGRAM_BYTES + 1)  # one more: a longer datagram fails the length check
+                data = client.recv(MAX_DATAGRAM_BYTES + 1)  # a longer datagram fails the length check
             except BlockingIOError:
                 return
             except OSError:

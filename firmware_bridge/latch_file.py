@@ -1,8 +1,8 @@
-"""The emergency-stop latch on disk: a stop must hold although the bridge is killed and started again.
+"""The emergency-stop latch on disk: a stop outlives a killed and restarted bridge.
 
-The file exists while the latch holds and contains its reason. Its mere existence is the latch: a file that is empty,
-garbage, unreadable or no regular file counts as one, so neither a full disk nor a kill between two system calls loses
-it. A thread writes it, because a slow disk must not delay the bridge.
+The file exists while the stop is latched and contains its reason. Existence alone is the latch: an empty, damaged,
+unreadable or irregular file counts too, so neither a full disk nor a kill between two system calls loses it. A thread
+writes the file, because a slow disk must not delay the bridge.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from typing import Final
 _MAX_BYTES: Final = 400
 _WRITE_FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NONBLOCK | os.O_CLOEXEC
 _PATIENCE_NS: Final = 200_000_000
-"""A disk that takes longer does not delay the confirmation of a stop."""
+"""Longest time that the disk may delay the confirmation of a stop."""
 _EARLIER: Final = "emergency stop of an earlier bridge"
 
 
 def read_latch(path: Path) -> str:
-    """Reason of the latch that an earlier bridge has left at `path`, empty without one. Never waits."""
+    """Return the reason of an earlier bridge's latch at `path`, empty without one. Never waits."""
     try:
         _check_regular(path)
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -42,7 +42,7 @@ def read_latch(path: Path) -> str:
 
 
 def _check_regular(path: Path) -> None:
-    """Raise OSError for what is there but is no regular file: a device or FIFO is neither read, written nor removed."""
+    """Raise OSError unless the path is free or a regular file; a device or FIFO is never read, written or removed."""
     if not stat.S_ISREG(path.stat().st_mode):
         raise OSError(errno.EINVAL, "not a regular file")
 
@@ -55,19 +55,19 @@ class LatchFile:
         self._path = path
         self._report = report
         self._kept = read_latch(path)
-        self._change = self._done = 0  # numbers of the newest change and of the newest one that was carried out
+        self._change = self._done = 0  # numbers of the newest requested change and of the newest completed one
         self._changed_ns = 0
         self.failed = False
-        """The last change could not be carried out."""
+        """Whether the last change failed."""
         self._changes: queue.SimpleQueue[tuple[int, str] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._write_changes, name="latch-file", daemon=True)
         self._thread.start()
 
     def keep(self, reason: str, now_ns: int) -> bool:
-        """Make the file hold `reason`, or remove it when that is empty.
+        """Request a file with `reason`, or no file for an empty one.
 
-        Returns whether a kill now would leave the file as it should be, or it has failed or takes too long. An
-        operator gets a stop confirmed only then.
+        Returns whether a stop may be confirmed to the operator: the file is as requested, has failed, or takes too
+        long.
         """
         if reason != self._kept:
             self._kept, self._changed_ns, self._change = reason, now_ns, self._change + 1
@@ -75,7 +75,7 @@ class LatchFile:
         return self._done == self._change or now_ns - self._changed_ns > _PATIENCE_NS
 
     def close(self, timeout_s: float) -> None:
-        """Give the disk up to `timeout_s` to take the last change."""
+        """Wait up to `timeout_s` for the last change, then end."""
         self._changes.put(None)
         self._thread.join(timeout_s)
 
@@ -88,7 +88,7 @@ class LatchFile:
                     with contextlib.suppress(OSError):  # not every file system can be synced
                         self._sync(reason)
             except OSError as error:
-                self.failed, self._done = True, number  # as well as it goes
+                self.failed, self._done = True, number  # completed as far as possible
                 failed = ("cannot be written", "may not survive") if reason else ("cannot be removed", "will survive")
                 text = f"{failed[0]} ({error.strerror}): an emergency stop {failed[1]} a restart of the bridge"
                 self._report(f"latch file {self._path}: {text}")
@@ -97,7 +97,7 @@ class LatchFile:
         with contextlib.suppress(FileNotFoundError):
             _check_regular(self._path)
         if reason:
-            # Not a temporary file, synced and renamed: the latch must exist before anything waits for the disk.
+            # Write in place instead of renaming a synced file: the latch must exist before the wait for the disk.
             descriptor = os.open(self._path, _WRITE_FLAGS, 0o600)
             try:
                 os.write(descriptor, reason.encode("utf-8", "replace")[:_MAX_BYTES])
@@ -107,7 +107,7 @@ class LatchFile:
             self._path.unlink(missing_ok=True)
 
     def _sync(self, reason: str) -> None:
-        """For a power cut; a kill of the process needs none."""
+        """Sync to survive a power cut; a killed process needs no sync."""
         for path in (self._path, self._path.parent) if reason else (self._path.parent,):
             descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
             try:

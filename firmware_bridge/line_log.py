@@ -1,4 +1,4 @@
-"""Lines for the operator from a thread of their own: a stalled terminal or journal must not hold the bridge up."""
+"""Writes lines for the operator in a separate thread: a stalled terminal or journal must not delay the bridge."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TextIO
 
 
 class LineLog:
-    """Bounded queue in front of a text stream; `write` never waits; a line that does not fit is dropped and counted."""
+    """Bounded queue in front of a text stream. `write` never waits; a line that does not fit is dropped and counted."""
 
     def __init__(self, stream: TextIO, prefix: str, *, capacity: int = 64) -> None:
         self.dropped = 0
@@ -27,13 +27,13 @@ class LineLog:
             self.dropped += 1
 
     def close(self, timeout_s: float) -> None:
-        """Give the stream up to `timeout_s` to take what is queued."""
+        """Wait up to `timeout_s` until the queued lines are written."""
         with contextlib.suppress(queue.Full):
             self._lines.put_nowait(None)
         self._thread.join(timeout_s)
 
     def _drain(self) -> None:
         for line in iter(self._lines.get, None):
-            with contextlib.suppress(OSError, ValueError):  # closed or full: nobody reads any more
+            with contextlib.suppress(OSError, ValueError):  # closed or full: no reader is left
                 self._stream.write(f"{self._prefix}: {line}\n")
                 self._stream.flush()

@@ -1,6 +1,6 @@
-"""What a service tells systemd (sd_notify(3)): ready, status line, watchdog, stopping. Outside a service: nothing.
+"""Notifies systemd (sd_notify(3)): ready, status line, watchdog, stopping. Outside a service it sends nothing.
 
-A message is one datagram, sent without waiting and lost if systemd does not read: nothing here delays or ends a loop.
+A message is one datagram, sent without waiting and lost if systemd does not read: it neither delays nor ends a loop.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ MAX_STATUS_CHARS: Final = 200
 
 
 class Notifier:
-    """The service manager's socket, as the environment that it gave this process names it; never blocks, never raises.
+    """The service manager's socket from the environment; it never blocks and never raises.
 
-    Every method returns whether its message has been sent: a `ready` that was not has to be sent again.
+    Every method returns whether its message was sent: an unsent `ready` must be sent again.
     """
 
     def __init__(self, environment: Mapping[str, str]) -> None:
-        """`environment`: os.environ, or a test's; an address that cannot be used is the same as none."""
+        """`environment`: os.environ, or a test's; an unusable address counts as none."""
         self._address = _address(environment.get("NOTIFY_SOCKET", ""))
         self._socket: socket.socket | None = None
         if self._address is not None:
@@ -30,35 +30,35 @@ class Notifier:
                 self._address = None
         timeout_us = _watchdog_us(environment) if self.enabled else None
         self.watchdog_period_ns: Final = None if timeout_us is None else timeout_us * 1000 // 2
-        """How often `watchdog` is due: half of the unit's WatchdogSec (sd_watchdog_enabled(3)); None: never."""
+        """Period of `watchdog`, ns: half of the unit's WatchdogSec (sd_watchdog_enabled(3)); None: no watchdog."""
 
     @property
     def enabled(self) -> bool:
-        """Whether a service manager listens at all."""
+        """Whether the environment names a service manager."""
         return self._address is not None
 
     def ready(self, text: str) -> bool:
-        """Start-up is complete: units that come after this one may start, and the watchdog begins to count."""
+        """Report that start-up is complete: later units may start, and the watchdog begins to count."""
         return self._send(f"READY=1\n{_status(text)}")
 
     def status(self, text: str) -> bool:
-        """One line for `systemctl status`; what does not fit is cut off."""
+        """Send one line for `systemctl status`, cut to fit."""
         return self._send(_status(text))
 
     def watchdog(self) -> bool:
-        """Still working: call it from the loop that does the work, and only while that loop is well."""
+        """Ping the watchdog; call it from the working loop, only while that loop is on time."""
         return self._send("WATCHDOG=1")
 
     def stopping(self, text: str) -> bool:
-        """The service has begun to end by itself or on request."""
+        """Report that the service has begun to end."""
         return self._send(f"STOPPING=1\n{_status(text)}")
 
     def extend(self, seconds: float) -> bool:
-        """Starting or stopping is going on and needs at most this much longer, counted from now."""
+        """Extend the time limit of starting or stopping to this long from now."""
         return self._send(f"EXTEND_TIMEOUT_USEC={max(0, round(seconds * 1e6))}")
 
     def close(self) -> None:
-        """Send nothing any more."""
+        """Close the socket; later messages are not sent."""
         self._address = None
         if self._socket is not None:
             self._socket.close()
@@ -68,7 +68,7 @@ class Notifier:
         if self._socket is None or self._address is None:
             return False
         try:
-            # To the address each time, not over a connection: it outlives a restart of the manager.
+            # Unconnected: sending to the address each time outlives a restart of the manager.
             self._socket.sendto(message.encode("utf-8", "replace"), self._address)
         except OSError:
             return False
@@ -76,14 +76,14 @@ class Notifier:
 
 
 def _address(name: str) -> str | None:
-    """Address of NOTIFY_SOCKET: a path, or `@name` in the abstract namespace; None for anything else."""
+    """Return the address of NOTIFY_SOCKET: a path, or `@name` in the abstract namespace; None otherwise."""
     if len(name) < 2 or name[0] not in "/@" or "\0" in name:
         return None
     return "\0" + name[1:] if name[0] == "@" else name
 
 
 def _watchdog_us(environment: Mapping[str, str]) -> int | None:
-    """WATCHDOG_USEC if it is meant for this process and is a time."""
+    """Return WATCHDOG_USEC if it is a duration for this process, else None."""
     text, pid = environment.get("WATCHDOG_USEC", ""), environment.get("WATCHDOG_PID", "")
     if pid and pid != str(os.getpid()):
         return None

@@ -1,7 +1,7 @@
 """`edge-bridge stop`, `arm`, `release` and `status`: an operator's connection to a running bridge.
 
-It uses a second socket, so the runner keeps its own, and a newer operator replaces the oldest of several, so no idle
-operator can block an emergency stop. A stop is confirmed by the robot's own speed and by nothing else.
+Operators have a second socket, apart from the runner's. A newer operator replaces the oldest of several, so no idle
+operator can block an emergency stop. Only the robot's own speed confirms a stop.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ from firmware_bridge.core.link import BridgeStatus
 
 CONFIRM_S: Final = 1.0
 _STAND_S: Final = 2.0  # for the robot to come to rest and report it: 0.8 m/s at 1 m/s2, and half as much again
-_MOVES_ON_S: Final = 0.7  # a robot that still moves this long after a stop: the operator must know now
+_MOVES_ON_S: Final = 0.7  # time after a stop at which the operator is warned that the robot still moves
 _POLL_S: Final = 0.005
 _USE_REMOTE: Final = "press L2 and B on its remote, or switch it off"
 
 
 @dataclass(frozen=True)
 class Unconfirmed:
-    """A bridge that answered but did not show the command done; `status` is its newest, None without one."""
+    """A bridge answered but did not confirm the command; `status` is its newest, None without one."""
 
     status: BridgeStatus | None
 
 
 Answer = BridgeStatus | BridgeUnavailable | Unconfirmed
-"""Of one socket: the status that shows the command done, why there is no bridge, or that it was not confirmed."""
+"""Result of one socket: the confirming status, the reason for no bridge, or a missing confirmation."""
 
 
 def operate(command: str, *sockets: Path) -> tuple[int, dict[str, object]]:
-    """Do `command` at every bridge that listens at one of `sockets`, report their states on stderr.
+    """Send `command` to every bridge that listens at one of `sockets`; report their states on stderr.
 
     Returns the exit code (0 done, 1 not confirmed by all in time, 3 refused or no bridge) and a status as JSON values.
-    `arm` is done at one bridge only: where several answer, the operator has to choose one.
+    `arm` needs a single bridge: where several answer, the operator has to choose one.
     """
     answers = _at_each("status" if command == "arm" else command, *sockets)
     reached = [socket for socket, answer in answers.items() if not isinstance(answer, BridgeUnavailable)]
@@ -93,7 +93,7 @@ def _is_hidden(error: BridgeUnavailable) -> bool:
 
 
 def _at_each(command: str, *sockets: Path) -> dict[Path, Answer]:
-    """At the same time: a bridge that hangs must not make another one wait for its stop."""
+    """Send to all sockets at the same time: a bridge that hangs must not delay another one's stop."""
     if not sockets:
         return {}
     different = list(dict.fromkeys(sockets))
@@ -102,7 +102,7 @@ def _at_each(command: str, *sockets: Path) -> dict[Path, Answer]:
 
 
 def _operate(command: str, socket: Path) -> Answer:
-    """Connect and ask; a stop is tried until CONFIRM_S has passed, whatever ends a connection."""
+    """Connect and send; a stop is repeated until CONFIRM_S has passed, whatever ends a connection."""
     deadline_ns = time.monotonic_ns() + round(CONFIRM_S * 1e9)
     while True:
         try:
@@ -119,7 +119,7 @@ def _operate(command: str, socket: Path) -> Answer:
 
 
 def _stop(client: BridgeClient) -> BridgeStatus | Unconfirmed:
-    """Stop, and follow the robot until it reports that it stands still; warn as soon as it does not obey."""
+    """Stop, and poll until the robot reports standstill; warn as soon as it does not obey."""
     asked_ns = time.monotonic_ns()
     latched = _follow(client, asked_ns, CONFIRM_S, _is_latched, again=client.stop)
     if isinstance(latched, Unconfirmed):
@@ -135,7 +135,7 @@ def _stop(client: BridgeClient) -> BridgeStatus | Unconfirmed:
 
 
 def _ask(command: str, client: BridgeClient) -> BridgeStatus | Unconfirmed:
-    """The status that shows the command done."""
+    """Return the status that confirms the command."""
     asked_ns = 0 if command == "status" else time.monotonic_ns()
     if command == "arm":
         client.arm()
@@ -151,9 +151,9 @@ def _follow(
     done: Callable[[BridgeStatus], bool],
     again: Callable[[], object] = lambda: None,
 ) -> BridgeStatus | Unconfirmed:
-    """The first status made after `since_ns` for which `done` is true, within `limit_s` of `since_ns` or of now.
+    """Return the first status after `since_ns` for which `done` is true, within `limit_s` of `since_ns` or of now.
 
-    `again` is called before every poll: a repeated stop changes nothing, a lost one would.
+    `again` is called before every poll: repeating a stop is harmless, losing one is not.
     """
     deadline_ns = (since_ns or time.monotonic_ns()) + round(limit_s * 1e9)
     status = None
@@ -167,12 +167,12 @@ def _follow(
 
 
 def _is_latched(status: BridgeStatus) -> bool:
-    """A stop shows as the reason not to arm, with the robot stopped or never driven."""
+    """Return whether a stop is in effect: it is the reason not to arm, and the robot is stopped or was never driven."""
     return status.blocked_by == "estop" and status.state in ("stopped", "disarmed")
 
 
 def _is_done(command: str, status: BridgeStatus) -> bool:
-    """An arm shows as a permission, a release as the end of the zeros."""
+    """Return whether an arm or release is in effect: a permission was given, or the zeros have ended."""
     if command == "arm":
         return status.permit != "needed" or status.state in ("arming", "armed")
     return command != "release" or (status.state in ("stopped", "disarmed") and not status.zero_after_stop)

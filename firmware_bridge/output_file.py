@@ -1,4 +1,4 @@
-"""Output files that a user names: regular files are replaced whole, anything else is written through.
+"""Writes output files that a user names: replaces regular files whole, writes to devices and FIFOs in place.
 
 `--json /dev/null` as root must not rename a file over the device node. The runner and the tools use this module too.
 """
@@ -15,17 +15,17 @@ from pathlib import Path
 from typing import Final
 
 READER_S: Final = 5.0
-"""Longest time that a FIFO or a device may take nothing, s: a reader that hangs must not keep a command for ever."""
-_LINKS: Final = 40  # Linux follows at most this many
+"""Longest time without progress on a FIFO or a device, s: a reader that hangs must not block a command."""
+_LINKS: Final = 40  # Linux follows at most this many links
 
 
 def regular_target(path: Path) -> Path | None:
-    """The regular file or new name that a path leads to, links followed; None for a device, a FIFO or a descriptor.
+    """Return the regular file or new name behind a path and its links; None for a device, a FIFO or a descriptor.
 
     Raises OSError for a directory, a socket, a loop of links and a name in a directory that does not exist.
     """
     try:
-        mode = path.stat().st_mode  # ELOOP and EACCES are the caller's
+        mode = path.stat().st_mode  # the caller handles ELOOP and EACCES
     except FileNotFoundError:
         target = Path(os.path.realpath(path))
         if path.is_symlink() and not target.parent.is_dir():
@@ -41,7 +41,7 @@ def regular_target(path: Path) -> Path | None:
 
 
 def check_output(path: Path) -> None:
-    """Refuse, before anything is done, a place that no file can be written to; raises OSError with one line."""
+    """Raise OSError with one line for a path that cannot be written; call it before any work."""
     if not path.name:
         raise OSError(f"{str(path)!r} is not the name of a file")
     target = regular_target(path)
@@ -65,7 +65,7 @@ def write_output(path: Path, data: bytes) -> None:
         return
     partial = partial_of(target)
     try:
-        # Exclusive: a link that somebody has put there is not followed.
+        # Exclusive: never follow another user's link.
         descriptor = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
         with os.fdopen(descriptor, "wb") as file:
             file.write(data)
@@ -77,17 +77,17 @@ def write_output(path: Path, data: bytes) -> None:
 
 
 def partial_of(target: Path) -> Path:
-    """Name beside a file for its next content, this process's own; an earlier one is removed."""
+    """Return this process's temporary name beside a file; remove a leftover of that name."""
     partial = target.with_name(f"{target.name}.{os.getpid()}.partial")
     partial.unlink(missing_ok=True)
     return partial
 
 
 def replace_regular(partial: Path, target: Path) -> None:
-    """Rename onto a regular file or a new name, with the permissions of the file that was there; raises OSError."""
+    """Rename onto a regular file or a new name, with the previous file's permissions; raises OSError."""
     with contextlib.suppress(FileNotFoundError):
         mode = target.lstat().st_mode
-        if not stat.S_ISREG(mode):  # it has changed since it was looked at
+        if not stat.S_ISREG(mode):  # it has changed since the check
             raise OSError(errno.EEXIST, "is no longer a regular file", str(target))
         partial.chmod(stat.S_IMODE(mode))
     partial.replace(target)
@@ -104,7 +104,7 @@ def open_through(path: Path) -> int:
 
 
 def write_descriptor(descriptor: int, data: bytes) -> None:
-    """Write all of it, without a buffer whose errors would come late; raises OSError."""
+    """Write all bytes without a buffer, which would delay errors; raises OSError."""
     rest = memoryview(data)
     poller = select.poll()
     poller.register(descriptor, select.POLLOUT)
@@ -123,7 +123,7 @@ def write_descriptor(descriptor: int, data: bytes) -> None:
 def _write_through(path: Path, data: bytes) -> None:
     descriptor = open_through(path)
     try:
-        if stat.S_ISREG(os.fstat(descriptor).st_mode):  # standard output that leads to a file: after what is there
+        if stat.S_ISREG(os.fstat(descriptor).st_mode):  # standard output redirected to a file: append
             os.lseek(descriptor, 0, os.SEEK_END)
         write_descriptor(descriptor, data)
     finally:
@@ -131,7 +131,7 @@ def _write_through(path: Path, data: bytes) -> None:
 
 
 def _is_descriptor(path: Path) -> bool:
-    """Whether a path leads through /proc, as /dev/stdout does: the open file counts, not the name that it once had."""
+    """Return whether a path leads through /proc, as /dev/stdout does: then the open file counts, not its name."""
     for _ in range(_LINKS):
         if os.path.realpath(path.parent).startswith("/proc/"):
             return True

@@ -1,4 +1,4 @@
-"""Which processes a client accepts as the bridge at the other end of a local socket."""
+"""Decides which process a client accepts as the bridge at the other end of a local socket."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _OTHERS_WRITE: Final = stat.S_IWGRP | stat.S_IWOTH
 
 
 def peer_uid(connected: socket.socket) -> int:
-    """User of the process that listens at the other end (SO_PEERCRED, unix(7))."""
+    """Return the user id of the listening process at the other end (SO_PEERCRED, unix(7))."""
     uid: int = _UCRED.unpack(connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _UCRED.size))[1]
     return uid
 
@@ -23,16 +23,16 @@ def peer_uid(connected: socket.socket) -> int:
 def is_trusted_listener(
     path: Path, uid: int, *, own_uid: int | None = None, lstat: Callable[[Path], os.stat_result] = Path.lstat
 ) -> bool:
-    """Whether a listener of user `uid` at `path` is accepted as the bridge.
+    """Return whether a listener of user `uid` at `path` is accepted as the bridge.
 
-    The user's own processes and root's are. A process of another user is accepted only in a folder that root has given
-    to this very user, such as systemd's RuntimeDirectory=: no third user can have put its socket there.
+    The user's own and root's processes are accepted. Another user's process is accepted only in a folder that root has
+    given to that user, such as systemd's RuntimeDirectory=: no third user can have placed a socket there.
     """
     return uid in (os.getuid() if own_uid is None else own_uid, 0) or _is_given_by_root(path, uid, lstat)
 
 
 def _is_given_by_root(path: Path, uid: int, lstat: Callable[[Path], os.stat_result]) -> bool:
-    """Whether only `uid` can write to the folder of `path`, and only root above it; a link is not accepted."""
+    """Return whether only `uid` can write to the folder of `path`, and only root above it; links are refused."""
     folder = path.absolute().parent
     owners = {folder: uid, **dict.fromkeys(folder.parents, 0)}
     try:

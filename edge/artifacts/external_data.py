@@ -1,8 +1,8 @@
-"""References of an ONNX file to weights outside itself, read from its bytes before any library opens it.
+"""Reads the references of an ONNX file to external weights from its bytes, before any library opens it.
 
 ONNX and ONNX Runtime have each been patched several times for external data that leaves the model's folder (`..`,
-symlinks, hard links, unknown keys: faults page, "Model artifacts"). So none of theirs is asked: this walks the protobuf
-wire format down to every tensor, wherever one may sit, and the caller compares what it finds with the manifest.
+symlinks, hard links, unknown keys: faults page, "Model artifacts"). This module therefore does not use their parsers.
+It walks the protobuf wire format down to every tensor, and the caller compares the references with the manifest.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ _VARINT, _I64, _BYTES, _I32 = 0, 1, 2, 5
 
 
 class ExternalDataError(ValueError):
-    """Bytes that are no ONNX model, or external data that it may not ask for; one line."""
+    """The bytes are not an ONNX model, or refer to forbidden external data; one line."""
 
 
 @dataclass(frozen=True)
 class ExternalData:
-    """A tensor's place in a file beside the model."""
+    """Location of a tensor in a file beside the model."""
 
     location: str
     offset: int
@@ -44,7 +44,7 @@ class ExternalData:
 
 
 def external_data(model: bytes) -> Iterator[ExternalData]:
-    """Every reference of an ONNX model to data outside it; raises ExternalDataError."""
+    """Return every reference of an ONNX model to external data; raises ExternalDataError."""
     waiting: list[tuple[str, memoryview]] = [("ModelProto", memoryview(model))]
     while waiting:
         kind, body = waiting.pop()
@@ -66,7 +66,7 @@ def _reference(entries: list[memoryview]) -> ExternalData:
         except UnicodeDecodeError as error:
             raise ExternalDataError("external data that is not text") from error
         if key not in _KEYS or key in found:
-            raise ExternalDataError(f"external data with the key {key!r}, known once each are {sorted(_KEYS)}")
+            raise ExternalDataError(f"external data with the key {key!r}, expected {sorted(_KEYS)} once each")
         found[key] = value
     numbers = {key: _number(key, found[key]) for key in ("offset", "length") if key in found}
     return ExternalData(found.get("location", ""), numbers.get("offset", 0), numbers.get("length"))
@@ -79,7 +79,7 @@ def _number(key: str, text: str) -> int:
 
 
 def _fields(body: memoryview) -> Iterator[tuple[int, memoryview]]:
-    """(number, content) of a message's length-delimited fields; the others are skipped."""
+    """Yield (number, content) of a message's length-delimited fields; skip the others."""
     at, end = 0, len(body)
     while at < end:
         tag, at = _varint(body, at)

@@ -1,4 +1,4 @@
-"""Files of an artifact directory: the manifest, sealed by a hash of its own, and what it lists."""
+"""Files of an artifact directory: the manifest, sealed by its own hash, and the listed files."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from firmware_bridge.core.version import ARTIFACT_SCHEMA
 SCHEMA_VERSION = ARTIFACT_SCHEMA
 MANIFEST_NAME = "manifest.json"
 SIGNATURE_NAME = "manifest.sig"
-"""Beside the manifest, which cannot list it: it signs the manifest's bytes (`edge.artifacts.trust`)."""
+"""Signature of the manifest's bytes; the manifest cannot list it (`edge.artifacts.trust`)."""
 MAX_MANIFEST_BYTES = 4_000_000
 HASH_BLOCK_BYTES = 1 << 20
 SEAL = "manifest_sha256"
-"""Key of the manifest's hash of itself: one wrong bit in a rate or an id would drive as silently as one in a weight."""
+"""Key of the manifest's own hash: a wrong bit in a rate or an id is as dangerous as one in a weight."""
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*", re.ASCII)
 _SUFFIXES = (".onnx", ".onnx.data", ".json", ".html")
-"""Everything that an export writes. Nothing that could be run or unpickled has a place in an artifact directory."""
+"""All file kinds of an export. An artifact directory contains nothing that could be run or unpickled."""
 _REFUSED_CONTENT = (
     (re.compile(rb"\x80[\x02-\x05]"), "a pickle"),
     (re.compile(rb"PK\x03\x04"), "a zip archive (.pt, .npz)"),
@@ -35,15 +35,15 @@ SECTIONS = ("schema_version", "target", "model", "runtime", "graphs", "files", "
 
 
 class ArtifactError(ValueError):
-    """An artifact directory that must not be run; its text is the one line to show."""
+    """An artifact directory that must not be run; the message is one line."""
 
 
 @dataclass(frozen=True)
 class FileIdentity:
-    """Identity of a file: whether it is still the one that was hashed.
+    """Identity of a file, which shows whether it is still the hashed one.
 
-    Anybody who may write a file can set its time of modification. The kernel alone sets its time of change: a write, a
-    rename and that setting itself all advance it.
+    Any user with write access can set the modification time. Only the kernel sets the change time: a write, a rename
+    and a new modification time all advance it.
     """
 
     device: int
@@ -54,24 +54,24 @@ class FileIdentity:
 
     @classmethod
     def of(cls, path: Path) -> FileIdentity:
-        """Identity of the file at a path; raises OSError."""
+        """Return the identity of the file at a path; raises OSError."""
         return cls.from_stat(path.stat(follow_symlinks=False))
 
     @classmethod
     def from_stat(cls, found: os.stat_result) -> FileIdentity:
-        """Identity of a file by its status."""
+        """Return the identity of a file by its status."""
         return cls(found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns)
 
 
 def seal(manifest: Mapping[str, Any]) -> dict[str, Any]:
-    """The manifest with the hash of everything else in it."""
+    """Return the manifest with the hash of its other content."""
     content = {key: value for key, value in manifest.items() if key != SEAL}
     text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
     return {**content, SEAL: hashlib.sha256(text.encode("ascii")).hexdigest()}
 
 
 def read_manifest_bytes(directory: Path) -> bytes:
-    """The manifest as it lies there, unchecked; raises ArtifactError."""
+    """Read the manifest's bytes, unchecked; raises ArtifactError."""
     path = directory / MANIFEST_NAME
     if not directory.is_dir():
         raise ArtifactError(f"{directory}: not a directory; make one with edge-export --out {directory}")
@@ -88,12 +88,12 @@ def read_manifest_bytes(directory: Path) -> bytes:
 
 
 def read_manifest(directory: Path) -> dict[str, Any]:
-    """The manifest as JSON, checked for its hash, version and sections; raises ArtifactError."""
+    """Read the manifest as JSON; check its hash, version and sections; raises ArtifactError."""
     return parse_manifest(directory, read_manifest_bytes(directory))
 
 
 def parse_manifest(directory: Path, raw: bytes) -> dict[str, Any]:
-    """The manifest in bytes read from a directory, checked for its hash, version and sections; raises ArtifactError."""
+    """Parse a manifest's bytes; check its hash, version and sections; raises ArtifactError."""
     path = directory / MANIFEST_NAME
     try:
         manifest: Any = json.loads(raw)
@@ -114,7 +114,7 @@ def parse_manifest(directory: Path, raw: bytes) -> dict[str, Any]:
 
 
 def check_entry(name: str, entry: Any) -> None:
-    """A listed file has a plain name, of a kind that belongs here, a size and a hash; raises ArtifactError."""
+    """Check that a listed file has a plain name of a permitted kind, a size and a hash; raises ArtifactError."""
     if not _PLAIN_NAME.fullmatch(name) or name in (MANIFEST_NAME, SIGNATURE_NAME):
         raise ArtifactError(f"{MANIFEST_NAME}: file name {name!r} is not a plain name")
     if not name.endswith(_SUFFIXES):
@@ -129,11 +129,11 @@ def check_entry(name: str, entry: Any) -> None:
 
 
 def read_file(directory: Path, name: str, entry: Any) -> bytes:
-    """The content of a listed file, whose size and hash were checked; raises ArtifactError."""
+    """Read a listed file and check its size and hash; raises ArtifactError."""
     check_entry(name, entry)
     path = directory / name
     with _open_listed(path, entry) as file:
-        # One byte more than it had: a file that grows meanwhile is noticed by its hash.
+        # One byte more than listed, so that the hash of a growing file differs.
         data = file.read(entry["bytes"] + 1)
     _compare(path, hashlib.sha256(data).hexdigest(), entry)
     for magic, kind in _REFUSED_CONTENT:
@@ -143,14 +143,14 @@ def read_file(directory: Path, name: str, entry: Any) -> bytes:
 
 
 def hash_file(directory: Path, name: str, entry: Any) -> FileIdentity:
-    """Verify a file that is too large to be held; returns what it is recognised by afterwards."""
+    """Verify a file that is too large for memory; return its identity."""
     check_entry(name, entry)
     path = directory / name
     digest = hashlib.sha256()
     with _open_listed(path, entry) as file:
         found = os.fstat(file.fileno())
         if found.st_nlink > 1:
-            # It is mapped while the robot drives: another name of the file could change it under the policy.
+            # The file is mapped while the robot drives: a second name could change it under the policy.
             raise ArtifactError(f"{path}: has {found.st_nlink} names (hard links); copy the directory instead")
         while block := file.read(HASH_BLOCK_BYTES):
             digest.update(block)
@@ -164,14 +164,14 @@ def _open_listed(path: Path, entry: Mapping[str, Any]) -> Iterator[IO[bytes]]:
         with _open_regular(path) as file:
             size = os.fstat(file.fileno()).st_size
             if size != entry["bytes"]:
-                raise ArtifactError(f"{path}: {size} bytes, the manifest says {entry['bytes']}; export again")
+                raise ArtifactError(f"{path}: {size} bytes, the manifest lists {entry['bytes']}; export again")
             yield file
     except OSError as error:
         raise ArtifactError(f"{path}: missing or not a regular file ({error.strerror})") from error
 
 
 def _open_regular(path: Path) -> IO[bytes]:
-    """Open a regular file for reading, and nothing else: no link is followed, no pipe waited for; raises OSError."""
+    """Open only a regular file for reading: never follow a link or wait for a pipe; raises OSError."""
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
@@ -181,4 +181,4 @@ def _open_regular(path: Path) -> IO[bytes]:
 
 def _compare(path: Path, found: str, entry: Mapping[str, Any]) -> None:
     if found != entry["sha256"]:
-        raise ArtifactError(f"{path}: sha256 {found[:12]}…, the manifest says {entry['sha256'][:12]}…; export again")
+        raise ArtifactError(f"{path}: sha256 {found[:12]}…, the manifest lists {entry['sha256'][:12]}…; export again")

@@ -47,19 +47,19 @@ class TensorContract:
 
 @dataclass(frozen=True)
 class SessionConfig:
-    """How a graph is opened: ONNX Runtime's execution provider, its options, threads."""
+    """Session of a graph: ONNX Runtime's execution provider, its options, threads."""
 
     provider: str
     options: Mapping[str, str]
     threads: int | None
     """Intra-op threads; None leaves them to the runner."""
     engine: bool
-    """The provider compiles an engine, which has to be built on the device before any run."""
+    """Whether the provider compiles an engine, which must be built on the device before any run."""
 
 
 @dataclass(frozen=True)
 class GraphContract:
-    """What one graph file takes and gives."""
+    """Inputs and outputs of one graph file."""
 
     file: str
     data_files: tuple[str, ...]
@@ -90,7 +90,7 @@ class GraphContract:
 
 @dataclass(frozen=True)
 class RuntimeConfig:
-    """What the runner needs to know of the model beyond its graphs."""
+    """The runner's settings from the manifest."""
 
     image_px: int
     frame_tokens: int
@@ -107,13 +107,13 @@ class RuntimeConfig:
     img_end_id: int
     img_context_id: int
     control_cores: tuple[int, ...]
-    """Processor cores of the control thread; empty: the runner decides by those it finds."""
+    """Processor cores of the control thread; empty: the runner chooses among the available ones."""
     reasoning_cores: tuple[int, ...]
     control_priority: int
     """Real-time priority of the control thread, above 0 and below the bridge's; 0: none."""
     decoding: Decoding = Decoding.CONSTRAINED
     recovery: RecoverySwitch = RecoverySwitch.ON
-    """Switches that are in force unless a command's options say otherwise; older manifests lack them."""
+    """Default switches, which a command's options override; older manifests lack them."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -143,9 +143,9 @@ class Artifacts:
     contents: Mapping[str, bytes]
     """Every file but the graphs' data files."""
     identities: Mapping[str, FileIdentity]
-    """The data files as they were when they were hashed."""
+    """Identities of the data files at their hashing."""
     release: int | None = None
-    """Release counter of the signature that was asked for; None: none was."""
+    """Release counter of the required signature; None: no signature was required."""
 
     @property
     def language_graphs(self) -> tuple[str, ...]:
@@ -154,11 +154,11 @@ class Artifacts:
 
     @property
     def guided_by_waypoints(self) -> bool:
-        """Whether the action expert is given the waypoints that were written, instead of last-layer K‖V."""
+        """Whether the action expert receives the text's waypoints instead of last-layer K‖V."""
         return any(tensor.name == "waypoints" for tensor in self.graphs["semantic_context"].inputs)
 
     def check_unchanged(self, names: Iterable[str]) -> None:
-        """Raise ArtifactError if a data file is not the one that was hashed any more."""
+        """Raise ArtifactError if a data file has changed since its hashing."""
         for name in names:
             path = self.directory / name
             try:
@@ -199,7 +199,7 @@ def load_artifacts(directory: Path, trust: Trust | None = None) -> Artifacts:
     }
     surplus = sorted(set(_section(manifest, "graphs")) - set(graphs))
     if surplus:
-        raise ArtifactError(f"{MANIFEST_NAME}: graph {surplus[0]!r} is not one that the runner knows")
+        raise ArtifactError(f"{MANIFEST_NAME}: graph {surplus[0]!r} is unknown to the runner")
     if "tokenizer.json" not in contents:
         raise ArtifactError(f"{directory}: tokenizer.json is missing from the manifest")
     model = _section(manifest, "model")
@@ -224,7 +224,7 @@ def load_artifacts(directory: Path, trust: Trust | None = None) -> Artifacts:
 
 
 def _check_external_data(graph: GraphContract, content: bytes, identities: Mapping[str, FileIdentity]) -> None:
-    """Weights outside a graph lie in the data files that the manifest lists for it, and inside those."""
+    """Check that a graph's external weights are within the data files that the manifest lists for it."""
     try:
         for data in external_data(content):
             if data.location not in graph.data_files:
@@ -244,7 +244,7 @@ def _section(manifest: Mapping[str, Any], name: str) -> dict[str, Any]:
 
 
 def _data_files(graph: Any) -> list[str]:
-    """Data files that a graph's entry names; raises ArtifactError."""
+    """Return the data files of a graph's entry; raises ArtifactError."""
     names = graph.get("data_files") if isinstance(graph, dict) else None
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ArtifactError(f"{MANIFEST_NAME}: every graph must list its data_files")
@@ -311,7 +311,7 @@ def _runtime(section: dict[str, Any]) -> RuntimeConfig:
 
 
 def _switches(section: Mapping[str, Any]) -> dict[str, Any]:
-    """The switches that a runtime section has; raises ArtifactError."""
+    """Read the switches of a runtime section; raises ArtifactError."""
     try:
         return {key: kind(section[key]) for key, kind in _SWITCHES.items() if key in section}
     except ValueError as error:
@@ -320,7 +320,7 @@ def _switches(section: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_contract(artifacts: Artifacts) -> None:
-    """The graphs must fit one another and the runner: names, types and widths; raises ArtifactError."""
+    """Check that the graphs fit one another and the runner: names, types and widths; raises ArtifactError."""
     vision, context, action = (artifacts.graphs[n] for n in ("vision_encoder", "semantic_context", "action_expert"))
     first, last = (artifacts.graphs[name] for name in (artifacts.language_graphs[0], artifacts.language_graphs[-1]))
     runtime = artifacts.runtime
@@ -367,7 +367,7 @@ def check_contract(artifacts: Artifacts) -> None:
 
 
 def _guidance(artifacts: Artifacts) -> tuple[TensorContract, str, tuple[int | str, ...]]:
-    """What the semantic context is made from, and the form that the runner gives it in."""
+    """Return the semantic context's input, with the runner's type and shape."""
     context = artifacts.graphs["semantic_context"]
     if artifacts.guided_by_waypoints:
         return context.input("waypoints"), "float", (1, len(WAYPOINT_TIMES_S), 2)

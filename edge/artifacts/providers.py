@@ -31,12 +31,12 @@ ALLOWED: Final[Mapping[str, frozenset[str]]] = {
     }),
     OPENVINO: frozenset({"device_type", "num_of_threads", "num_streams", "precision"}),
 }  # fmt: skip
-"""Those of the shipped targets, and others of their kind for targets of one's own."""
+"""Permitted options: those of the shipped targets, and similar ones for users' targets."""
 _VALUE: Final = re.compile(r"[A-Za-z0-9_.:,+-]{0,4096}", re.ASCII)
 
 
 def wrong_option(provider: str, options: Mapping[str, str]) -> str | None:
-    """Return what is wrong with the options of a provider, for a message; None if nothing is."""
+    """Return the defect of a provider's options, for a message; None for valid options."""
     allowed = ALLOWED.get(provider, frozenset())
     for key, value in options.items():
         if key not in allowed:
@@ -88,11 +88,11 @@ class DeviceNode:
     path: Path
     """Path on the machine, without the root of the search."""
     group: str | None
-    """Group that may open it; None if everybody may, or if only root's group may."""
+    """Group that may open it; None if all users may, or only root's group."""
 
 
 def device_nodes(providers: Sequence[str], root: Path = Path("/")) -> list[DeviceNode]:
-    """Nodes of these providers that exist; none for a provider that computes on the processor."""
+    """Return the existing nodes of these providers; none for a provider on the processor."""
     found: dict[Path, DeviceNode] = {}
     patterns = (pattern for provider in providers for pattern in PATTERNS.get(provider, ()))
     for pattern in dict.fromkeys(pattern.glob for pattern in patterns):

@@ -20,14 +20,14 @@ class TargetFacts:
     architectures: tuple[str, ...]
     cores: int
     memory_bytes: int
-    """Memory that the model shares with everything else; a graphics card's own where it has its own."""
+    """Memory that the model shares with all programs; a graphics card's own memory where it has one."""
     available_bytes: int
-    """Of it, what is left for this program."""
+    """Part of it that is available to this program."""
     min_l4t: str | None
     power_mode: str
     budget_w: float | None
     own_memory: bool = False
-    """The memory is a graphics card's own; the machine's is not known."""
+    """Whether the memory is a graphics card's own; the machine's is then unknown."""
 
     def __post_init__(self) -> None:
         if not self.name or not self.architectures or not self.power_mode:
@@ -41,11 +41,11 @@ class TargetFacts:
 
 @dataclass(frozen=True)
 class PlanFacts:
-    """What the plan expects of the device (`plan`)."""
+    """The plan's expectations of the device (`plan`)."""
 
     period_ms: float
     tick_ms: float
-    """A tick with reasoning beside it."""
+    """Duration of a tick during reasoning."""
     tick_alone_ms: float
     tick_error: float
     """Relative half width of the tick's error bar; 0 if the plan gives none."""

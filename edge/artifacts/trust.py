@@ -22,7 +22,7 @@ from typing import Any
 from edge.artifacts.files import SIGNATURE_NAME, ArtifactError
 
 STATE_DIRECTORY = Path("/var/lib/tic-vla-edge")
-"""Where the units keep what the runner has to remember (systemd's StateDirectory)."""
+"""Folder of the runner's persistent state in the units (systemd's StateDirectory)."""
 MAX_RELEASE = 2**63 - 1
 SCHEMA = 1
 _CONTEXT = b"tic-vla-edge artifacts 1\0"  # a signature made for anything else is none here
@@ -32,12 +32,12 @@ _COUNTER_KEYS = {"schema": int, "key_id": str, "release": int}
 
 
 class KeyFileError(ValueError):
-    """A key file that cannot be used; one line."""
+    """An unusable key file; one line."""
 
 
 @dataclass(frozen=True)
 class Ed25519:
-    """The part of `cryptography` that is used, loaded only by those who sign or trust."""
+    """The used part of `cryptography`, loaded only for signing or trust."""
 
     private: Any
     public: Any
@@ -69,7 +69,7 @@ def key_id_of(library: Ed25519, key: Any) -> str:
 class Trust:
     """A public key on the robot, and the file that remembers the last release accepted under it.
 
-    Raises KeyFileError when the key cannot be read: a robot configured to trust a key never goes on without it.
+    Raises KeyFileError when the key cannot be read: a robot that is configured to trust a key never runs without it.
     """
 
     def __init__(self, key_file: Path, counter_file: Path) -> None:
@@ -86,7 +86,7 @@ class Trust:
         self.key_id = key_id_of(self._library, loaded)
 
     def check(self, directory: Path, manifest: bytes) -> int:
-        """The release that the signature beside a manifest names; raises ArtifactError. Changes nothing."""
+        """Return the release of the signature beside a manifest; raises ArtifactError. Changes nothing."""
         path = directory / SIGNATURE_NAME
         if not path.exists() and not path.is_symlink():
             raise ArtifactError(
@@ -112,7 +112,7 @@ class Trust:
         return release
 
     def accept(self, release: int) -> None:
-        """Remember that a release has been accepted; raises ArtifactError when that is not possible."""
+        """Store that a release was accepted; raises ArtifactError when that fails."""
         last = self._last_release()
         if last is not None and last >= release:
             return
@@ -130,7 +130,7 @@ class Trust:
         if not self._counter_file.exists() and not self._counter_file.is_symlink():
             return None
         found = _read_record(self._counter_file, _COUNTER_KEYS)
-        # Another key is another row of releases.
+        # Each key has its own sequence of releases.
         return int(found["release"]) if found["key_id"] == self.key_id else None
 
 
@@ -146,7 +146,7 @@ def read_small(path: Path) -> bytes:
 
 
 def _read_record(path: Path, keys: dict[str, type]) -> dict[str, Any]:
-    """A small JSON object of exactly these keys; raises ArtifactError."""
+    """Read a small JSON object with exactly these keys; raises ArtifactError."""
     try:
         found: Any = json.loads(read_small(path))
     except OSError as error:
@@ -166,7 +166,7 @@ def _read_record(path: Path, keys: dict[str, type]) -> dict[str, Any]:
 
 
 def write_durably(path: Path, text: str, mode: int) -> None:
-    """Write a file so that after a power cut the old one or the new one is there, whole; raises OSError."""
+    """Write a file atomically: after a power cut the old or the new content is complete; raises OSError."""
     partial = path.with_name(path.name + ".partial")
     try:
         descriptor = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC | os.O_NOFOLLOW, mode)

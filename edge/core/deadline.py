@@ -1,4 +1,4 @@
-"""Waits for what may hang, under one deadline for everything that has to end."""
+"""Waits for functions that may hang, under one common deadline."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ from collections.abc import Callable
 
 
 class Deadline:
-    """`seconds` from when it was made."""
+    """Instant `seconds` after its creation."""
 
     def __init__(self, seconds: float, clock: Callable[[], int] = time.monotonic_ns) -> None:
         self._clock = clock
         self._end_ns = clock() + round(seconds * 1e9)
 
     def left_s(self, at_most_s: float | None = None) -> float:
-        """Time that is left, never negative."""
+        """Return the remaining time, s, never negative."""
         left_s = max(0.0, (self._end_ns - self._clock()) / 1e9)
         return left_s if at_most_s is None else min(left_s, at_most_s)
 
     def run(self, name: str, body: Callable[[], object]) -> bool:
-        """Run what may hang, for as long as is left; whether it ended in time. Raises what `body` raises."""
+        """Run `body` for at most the remaining time; return whether it ended. Raises what `body` raises."""
         return run_in_thread(name, body, self.left_s())
 
 
 def run_in_thread(name: str, body: Callable[[], object], timeout_s: float | None = None) -> bool:
-    """Run `body` in a thread and wait for it; whether it has ended. Raises what `body` raises."""
+    """Run `body` in a thread and wait for it; return whether it has ended. Raises what `body` raises."""
     errors: list[BaseException] = []
 
     def target() -> None:
@@ -34,7 +34,7 @@ def run_in_thread(name: str, body: Callable[[], object], timeout_s: float | None
         except BaseException as error:  # noqa: BLE001 - raised again in the caller's thread
             errors.append(error)
 
-    # A daemon where it may outlast its time: a thread that hangs must not keep the process from ending.
+    # A daemon thread: one that hangs must not keep the process alive.
     thread = threading.Thread(target=target, name=name, daemon=timeout_s is not None)
     thread.start()
     thread.join(timeout_s)

@@ -22,21 +22,21 @@ _LIBRARY_FOLDERS = ("usr/lib/aarch64-linux-gnu", "usr/lib/x86_64-linux-gnu", "us
 
 
 class DeviceError(ValueError):
-    """A device that is not the one that is needed; its text is the one line to show."""
+    """The device is not the required one; the message is one line."""
 
 
 @dataclass(frozen=True)
 class DeviceFacts:
-    """Everything that a compiled engine depends on besides the model; nothing in it changes with the power mode."""
+    """All inputs of a compiled engine besides the model; none depends on the power mode."""
 
     architecture: str
     device: str
-    """What computes, by its own name: the Jetson module, else the graphics card; the processor for its providers."""
+    """Name of the computing device: the Jetson module, else the graphics card; the processor for its providers."""
     l4t: str | None
     """Jetson Linux release, e.g. `36.4.3`."""
     onnxruntime: str
     provider_version: str | None
-    """Version of TensorRT or OpenVINO; None if it does not say."""
+    """Version of TensorRT or OpenVINO; None if unavailable."""
 
     def to_dict(self) -> dict[str, str | None]:
         """Plain JSON form."""
@@ -44,7 +44,7 @@ class DeviceFacts:
 
 
 def package_version(name: str) -> str | None:
-    """Version of an installed Python package, None without it."""
+    """Return the version of an installed Python package; None without it."""
     try:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
@@ -52,19 +52,19 @@ def package_version(name: str) -> str | None:
 
 
 def available_providers() -> list[str]:
-    """Execution providers that this ONNX Runtime has."""
+    """Return the execution providers of this ONNX Runtime."""
     return list(ort.get_available_providers())
 
 
 def shares_device(providers: Iterable[str], others: Iterable[str]) -> bool:
-    """Whether some of either list compute on one accelerator, where calls wait for each other whatever the cores."""
+    """Return whether both lists use one accelerator, on which calls wait for each other whatever the cores."""
     return any(p in _ACCELERATED for p in providers) and any(p in _ACCELERATED for p in others)
 
 
 def read_device(
     provider: str, root: Path = Path("/"), version_of: Callable[[str], str | None] = package_version
 ) -> DeviceFacts:
-    """Facts of the device below `root` that matter to a provider's engines."""
+    """Read the facts of the device that a provider's engines depend on, below `root`."""
     return DeviceFacts(
         architecture=platform.machine(),
         device=_device(provider, root) or "unknown",
@@ -75,7 +75,7 @@ def read_device(
 
 
 def l4t_release(text: str) -> str | None:
-    """`36.4.3` from the first line of `/etc/nv_tegra_release`; None if it is not such a file."""
+    """Return `36.4.3` from the first line of `/etc/nv_tegra_release`; None for another text."""
     found = re.search(r"R(\d+) \(release\), REVISION: ([\d.]+)", text)
     return f"{found[1]}.{found[2]}" if found else None
 
@@ -94,7 +94,7 @@ def _text(path: Path) -> str:
 
 
 def _board(root: Path) -> str | None:
-    """Compatible string of a Jetson module, e.g. `nvidia,p3767-0000`."""
+    """Return the compatible string of a Jetson module, e.g. `nvidia,p3767-0000`."""
     names = _text(root / "proc/device-tree/compatible").split("\0")
     return next((name for name in names if re.fullmatch(r"nvidia,p\d{4}-\d{4}.*", name)), None)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 
 def wrap_angle(angle_rad: float) -> float:
-    """Same angle in [-π, π)."""
+    """Return the same angle in [-π, π)."""
     return (angle_rad + math.pi) % (2 * math.pi) - math.pi
 
 
@@ -42,7 +42,7 @@ class SE2:
 
 
 def interpolate(T_w_a: SE2, T_w_b: SE2, fraction: float) -> SE2:
-    """Pose between two poses: straight line in x and y, shortest arc in θ; fraction in [0, 1]."""
+    """Interpolate two poses: straight line in x and y, shortest arc in θ; fraction in [0, 1]."""
     turn = wrap_angle(T_w_b.theta_rad - T_w_a.theta_rad)
     return SE2(
         T_w_a.x_m + fraction * (T_w_b.x_m - T_w_a.x_m),

@@ -1,19 +1,19 @@
-"""A JPEG's picture size from its header, and whether it is safe to decode, without decoding it."""
+"""Reads a JPEG's picture size from its header and checks that it is safe to decode, without decoding it."""
 
 from __future__ import annotations
 
 _FRAME_HEADERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 """SOF0..SOF15 without DHT, JPG and DAC (ITU-T T.81, table B.1)."""
 _ALONE = frozenset((0x00, 0x01, 0xFF, *range(0xD0, 0xDA)))
-"""Markers without a length: what follows one of them here is not what a decoder takes it for."""
+"""Markers without a length, which must not occur before the frame header."""
 _MAX_SEGMENTS = 64
 MAX_PX = 4096
 MAX_BYTES = 8 * 1024 * 1024
-"""Of a picture: many times what a robot's camera sends, and 50 MB decoded; a header alone can ask for gigabytes."""
+"""Largest side of a picture, far above a robot camera's: 50 MB decoded. A header alone could demand gigabytes."""
 
 
 def jpeg_size(jpeg: bytes) -> tuple[int, int] | None:
-    """(width, height) in pixels; None when there is no frame header where there should be one."""
+    """Return (width, height) in pixels; None without a frame header at its place."""
     position = 2
     for _ in range(_MAX_SEGMENTS):
         if position + 9 > len(jpeg) or jpeg[position] != 0xFF:
@@ -29,7 +29,7 @@ def jpeg_size(jpeg: bytes) -> tuple[int, int] | None:
 
 
 def jpeg_refusal(jpeg: bytes) -> str | None:
-    """Why these bytes must not be given to a decoder, for a message; None when they may."""
+    """Return why these bytes must not be decoded, for a message; None when they may."""
     if len(jpeg) > MAX_BYTES:
         return f"{len(jpeg)} bytes, at most {MAX_BYTES}"
     size = jpeg_size(jpeg)

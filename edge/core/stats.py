@@ -9,9 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 
 EXACT = 65_536
-"""Samples kept one by one: 1.8 h of ticks at 10 Hz in 512 KiB."""
+"""Number of samples stored exactly: 1.8 h of ticks at 10 Hz in 512 KiB."""
 _LOW, _RATIO, _BINS = 1e-3, 1.01, 2084
-"""The histogram behind them: bins 1 % wide from 0.001 to 10⁶, in the samples' own unit."""
+"""Histogram of later samples: bins 1 % wide from 0.001 to 10⁶, in the samples' unit."""
 _QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999, "max": 1.0}
 
 
@@ -41,7 +41,7 @@ class Samples:
         self.newest = value
 
     def quantile(self, share: float) -> float | None:
-        """Nearest rank: the smallest value that at least `share` of all samples do not exceed; None if empty."""
+        """Return the smallest value that `share` of all samples or more do not exceed (nearest rank); None if empty."""
         if self._count == 0:
             return None
         if share >= 1:

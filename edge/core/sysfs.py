@@ -9,7 +9,7 @@ SYSFS: Final = Path("/sys")
 
 
 def read_text(path: Path) -> str | None:
-    """Text of the file without white space around it; None if it is missing, unreadable or empty."""
+    """Return the file's stripped text; None if it is missing, unreadable or empty."""
     try:
         return path.read_text(encoding="ascii", errors="replace").strip() or None
     except OSError:
@@ -17,7 +17,7 @@ def read_text(path: Path) -> str | None:
 
 
 def read_int(path: Path) -> int | None:
-    """Whole number in the file; None if there is none."""
+    """Return the file's whole number; None without one."""
     text = read_text(path)
     try:
         return None if text is None else int(text)
@@ -26,5 +26,5 @@ def read_int(path: Path) -> int | None:
 
 
 def hwmon_named(sysfs_root: Path, name: str) -> list[Path]:
-    """Folders of hwmon devices whose `name` is that one; their index differs from boot to boot."""
+    """Return the folders of hwmon devices with that `name`; their index differs between boots."""
     return [path for path in sorted((sysfs_root / "class/hwmon").glob("hwmon*")) if read_text(path / "name") == name]

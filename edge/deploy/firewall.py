@@ -1,8 +1,8 @@
-"""nftables rules for the robot's cable: text from facts, no file is touched.
+"""Formats nftables rules for the robot's cable; touches no file.
 
 The robot's body takes requests from any DDS participant that reaches it. These rules let only the services' users send
-on the cable, and only to the robot. DDS gives a service no port of its own, so they cannot separate the bridge's
-requests from the runner's reading: what remains is written down in docs/robot_network.md.
+on the cable, and only to the robot. DDS gives a service no separate port, so they cannot separate the bridge's requests
+from the runner's reading: docs/robot_network.md lists the remaining risk.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ from edge.deploy.unit_text import UnitError
 
 TABLE: Final = "tic_vla_edge"
 MULTICAST: Final = IPv4Network("239.255.0.1/32")
-"""Group by which DDS participants find each other (RTPS 2.5, section 9.6.1.4.1)."""
+"""Multicast group of DDS discovery (RTPS 2.5, section 9.6.1.4.1)."""
 _PORT_BASE: Final = 7400
 _PORTS_A_DOMAIN: Final = 250
 _MAX_PORT: Final = 65535
 
 
 def ports(domain: int) -> tuple[int, int]:
-    """First and last UDP port of a DDS domain (RTPS 2.5, section 9.6.2.3: base 7400, domain gain 250)."""
+    """Return the first and last UDP port of a DDS domain (RTPS 2.5, section 9.6.2.3: base 7400, domain gain 250)."""
     first = _PORT_BASE + _PORTS_A_DOMAIN * domain
     return first, min(first + _PORTS_A_DOMAIN - 1, _MAX_PORT)
 
 
 def ruleset(interface: str, networks: Sequence[IPv4Network], domain: int, users: Sequence[str]) -> str:
-    """Text of the nftables file; loading it again replaces the table. Raises UnitError.
+    """Return the nftables file; loading it again replaces the table. Raises UnitError.
 
-    `interface`: name of the robot's cable; `networks`: the robot, at best its one address; `domain`: DDS domain;
-    `users`: those that may send to the robot, root besides.
+    `interface`: name of the robot's cable; `networks`: the robot, at best its single address; `domain`: DDS domain;
+    `users`: users that may send to the robot, besides root.
     """
     if interface[:1].isdigit():
         raise UnitError(f"dds.interface: expected a name for the firewall, such as eth0, found {interface}")
@@ -43,7 +43,7 @@ def ruleset(interface: str, networks: Sequence[IPv4Network], domain: int, users:
     merged = collapse_addresses(networks)  # an interval set must not overlap
     robot = ", ".join(str(network.network_address if network.prefixlen == 32 else network) for network in merged)
     return f"""\
-# Made by edge-install units: what may pass the robot's cable. Write it anew instead of editing it.
+# Made by edge-install units: the traffic that may pass the robot's cable. Generate it again, do not edit it.
 # Check it with `nft -c -f FILE`; show the counters with `nft list table inet {TABLE}`.
 table inet {TABLE}
 delete table inet {TABLE}

@@ -1,4 +1,4 @@
-"""`edge-install units`: gathers what the units depend on, writes them, asks systemd about them; starts nothing."""
+"""`edge-install units`: collects the units' inputs, writes and checks the units; starts nothing."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ SYSTEM_RULES: Final = units.FIREWALL_FOLDER.relative_to("/")
 _MAX_INSTRUCTION_BYTES: Final = 16_384
 
 Addresses = Mapping[str, Sequence[tuple[str, str]]]
-"""Network interfaces: IPv4 addresses with their netmasks."""
+"""Return the network interfaces' IPv4 addresses with their netmasks."""
 
 
 def interface_addresses() -> Addresses:
@@ -56,14 +56,14 @@ def interface_addresses() -> Addresses:
 
 
 def nft_program() -> Path | None:
-    """Program that loads firewall rules; None: not installed."""
+    """Return the program that loads firewall rules; None: not installed."""
     found = shutil.which("nft", path="/usr/sbin:/sbin:/usr/bin")
     return None if found is None else Path(found)
 
 
 @dataclass(frozen=True)
 class Host:
-    """The machine as this module meets it; tests give others."""
+    """Access to the machine; tests replace it."""
 
     root: Path = Path("/")
     addresses: Callable[[], Addresses] = interface_addresses
@@ -82,7 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--artifacts", type=Path, required=True, metavar="DIR", help="directory made by edge-export")
     parser.add_argument("--robot", type=Path, required=True, metavar="FILE.toml", help="the robot and its limits")
     text = parser.add_mutually_exclusive_group(required=True)
-    text.add_argument("--instruction", metavar="TEXT", help="what the robot is to do, in a sentence")
+    text.add_argument("--instruction", metavar="TEXT", help="instruction for the robot, in a sentence")
     text.add_argument("--instruction-file", type=Path, metavar="FILE", help="the same, read from a file now")
     place = parser.add_mutually_exclusive_group(required=True)
     place.add_argument("--out", type=Path, metavar="DIR", help="write the files here, to be read or copied")
@@ -118,7 +118,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, say: Callable[[str], None], host: Host | None = None) -> int:
-    """Write the units and check them; the exit code.
+    """Write the units and check them; return the exit code.
 
     Raises UnitError, ConfigError, InstructionError, KeyFileError or OSError for bad input, ArtifactError for artifacts
     to be refused.
@@ -132,7 +132,7 @@ def run(args: argparse.Namespace, say: Callable[[str], None], host: Host | None 
         if args.system:
             raise ArtifactError(f"{lacking}: the runner could not start; install on the device that it is made for")
         say(f"{lacking}: run this on the device itself before you use the runner's unit")
-    # An emergency stop's input may appear at start-up only; a calibration that is not there is refused here.
+    # An emergency stop's input may appear at start-up only; a missing calibration is refused here.
     needed = [inputs.robot, inputs.artifacts, *(path for path in inputs.robot_files if not path.is_relative_to("/sys"))]
     needed += [] if inputs.trust is None else [inputs.trust]
     if inputs.engines is not None and inputs.engines.is_dir():
@@ -181,7 +181,7 @@ def of_release(host: Host, home: Path) -> Host:
 
 
 def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
-    """Everything that the units depend on, from the arguments, the artifacts, the robot file and the machine."""
+    """Collect the units' inputs from the arguments, the artifacts, the robot file and the machine."""
     robot = load_robot_config(args.robot, socket=units.SOCKET)
     if not robot.safety.operator_arm and not args.arm_at_start:
         raise UnitError(
@@ -239,10 +239,10 @@ def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
 
 
 def unreadable(paths: Sequence[Path]) -> list[Path]:
-    """What of these files and folders, and of the way to them, only its owner or group may read."""
+    """Return those of these paths and their parents that other users cannot read."""
     closed: list[Path] = []
     for path in paths:
-        # What lies in a folder that the services do not see is shown to them without the way to it.
+        # Files below hidden folders are bound directly, without their parents.
         way = (
             [] if units.is_hidden(path) else [folder for folder in path.parents if not folder.stat().st_mode & S_IXOTH]
         )
@@ -263,15 +263,15 @@ def _instruction(args: argparse.Namespace) -> str:
 
 
 def _bridge_cores(artifacts: Artifacts, facts: TargetFacts) -> tuple[int, ...]:
-    """Cores that the target gives to neither thread of the runner; none if it gives no cores at all."""
+    """Return the cores that the target gives to neither thread of the runner; none if it gives no cores."""
     taken = {*artifacts.runtime.control_cores, *artifacts.runtime.reasoning_cores}
     return tuple(sorted(set(range(facts.cores)) - taken)) if taken else ()
 
 
 def robot_networks(dds: DdsConfig, given: Sequence[str], addresses: Callable[[], Addresses]) -> tuple[IPv4Network, ...]:
-    """Where the robot may be: the networks given, else that of the robot file's interface and its peers.
+    """Return the robot's networks: those given, else that of the robot file's interface and its peers.
 
-    Raises UnitError when the file alone does not tell, or when a network is too wide to filter anything.
+    Raises UnitError when the file alone does not determine them, or when a network is too wide for a filter.
     """
     networks: set[IPv4Network] = set()
     for text in given:
@@ -286,8 +286,8 @@ def robot_networks(dds: DdsConfig, given: Sequence[str], addresses: Callable[[],
     own = addresses().get(dds.interface, ())
     if not own:
         raise UnitError(
-            f"the robot file's interface {dds.interface!r} has no IPv4 address here, so the robot's network is not "
-            f"known: bring it up or give --network, e.g. 192.168.123.0/24"
+            f"the robot file's interface {dds.interface!r} has no IPv4 address here, so the robot's network is "
+            f"unknown: bring it up or give --network, e.g. 192.168.123.0/24"
         )
     networks.update(IPv4Network(f"{address}/{mask}", strict=False) for address, mask in own)
     for network in networks:
@@ -305,7 +305,7 @@ def robot_networks(dds: DdsConfig, given: Sequence[str], addresses: Callable[[],
 
 
 def _contents(args: argparse.Namespace, inputs: units.ServiceInputs, host: Host) -> dict[Path, str]:
-    """Text of every file by its path."""
+    """Return the text of every file by its path."""
     folder = host.root / SYSTEM_UNITS if args.system else args.out.absolute()
     contents = {
         folder / units.BRIDGE_UNIT: units.bridge_unit(inputs),
@@ -335,7 +335,7 @@ def _report_firewall(inputs: units.ServiceInputs, say: Callable[[str], None]) ->
 
 
 def _write(contents: Mapping[Path, str], *, force: bool) -> list[Path]:
-    """Write what differs, each file in one rename; refuses before the first if one is in the way."""
+    """Write the files that differ, each in one rename; refuse before the first if a path is not replaceable."""
     wanted: dict[Path, str] = {}
     for path, text in contents.items():
         if path.is_symlink() or (path.exists() and not path.is_file()):
@@ -348,7 +348,7 @@ def _write(contents: Mapping[Path, str], *, force: bool) -> list[Path]:
     for path, text in wanted.items():
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, text)
-        # systemd complains about units that anybody may write, and needs to read them as nobody in particular.
+        # systemd complains about world-writable units and needs world-readable ones.
         path.chmod(0o644)
     return list(wanted)
 
@@ -366,14 +366,13 @@ def _report(verdict: UnitVerdict, say: Callable[[str], None]) -> None:
 
 
 def _commands(contents: Mapping[Path, str], inputs: units.ServiceInputs, *, system: bool) -> list[str]:
-    """Commands that make the services run, for the operator to give."""
+    """Return the commands with which the operator starts the services."""
     prepare = (
         [] if system else [f"sudo install -D -m 0644 {shlex.quote(str(path))} {_home_of(path)}" for path in contents]
     )
     prepare += ["sudo systemd-sysusers", f'sudo usermod -aG {inputs.users.operators} "$USER"']
     firewall = [path.name for path in contents if path.name == units.FIREWALL_UNIT]
-    # Not enabled if it arms by itself: a machine that starts again after a brown-out must not drive before a person
-    # has seen it.
+    # Not enabled if it arms by itself: after a brown-out the machine must not drive before a person has checked it.
     drive = [f"sudo systemctl start {units.RUNNER_UNIT}"]
     if inputs.operator_arm:
         drive = [f"sudo systemctl enable --now {units.RUNNER_UNIT}", _bridge_command("arm", inputs)]

@@ -18,12 +18,12 @@ _VERSION = re.compile(r"systemd (\d+)")
 _NAMES_A_UNIT = re.compile(r"(?:^|/)([A-Za-z0-9@:_.\\-]+\.(?:service|socket|target|mount|timer|slice|path))\b")
 
 Runner = Callable[[Sequence[str]], tuple[int, str]]
-"""Runs a command; its exit status, and what it wrote to both outputs."""
+"""Runs a command; returns its exit status and the text of both outputs."""
 
 
 @dataclass(frozen=True)
 class UnitVerdict:
-    """What was found in a set of units."""
+    """Findings about a set of units."""
 
     complaints: tuple[str, ...]
     """Lines of `verify` about these units."""
@@ -32,11 +32,11 @@ class UnitVerdict:
     exposure: dict[str, float]
     """Score of each service."""
     not_checked: tuple[str, ...]
-    """What could not be checked, for the operator."""
+    """Checks that were not possible, for the operator."""
 
     @property
     def good(self) -> bool:
-        """No complaint, and no service more exposed than MAX_EXPOSURE."""
+        """Whether there is no complaint, and no service is more exposed than MAX_EXPOSURE."""
         return not self.complaints and all(score <= MAX_EXPOSURE for score in self.exposure.values())
 
 
@@ -49,7 +49,7 @@ def run_command(command: Sequence[str]) -> tuple[int, str]:
 
 
 def systemd_version(run: Runner = run_command, which: Callable[[str], str | None] = shutil.which) -> int | None:
-    """Version of this machine's systemd; None where there is none or it does not report one."""
+    """Return the version of this machine's systemd; None without systemd or a reported version."""
     tool = which("systemd-analyze")
     if tool is None:
         return None
@@ -89,7 +89,7 @@ def _check(tool: str, paths: Sequence[Path], run: Runner) -> UnitVerdict:
 
 
 def _verify(tool: str, paths: Sequence[Path], run: Runner) -> tuple[list[str], list[str]]:
-    """Lines about these units, and about others. An unknown key is a line, with status 0."""
+    """Return the lines about these units, and about others. An unknown key is a line, with status 0."""
     status, text = run([tool, "verify", "--man=no", *(str(path) for path in paths)])
     ours = {path.name for path in paths}
     complaints: list[str] = []

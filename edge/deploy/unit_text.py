@@ -21,11 +21,11 @@ Setting = tuple[str, str]
 
 
 class UnitError(ValueError):
-    """Something that cannot be put into a unit; its text is the one line to show."""
+    """A value that a unit cannot contain; the message is one line."""
 
 
 def word(text: str) -> str:
-    """One word of a list or the program of a command: quotes, backslashes and specifiers (%) are taken literally.
+    """Quote one word of a list or a command's program: quotes, backslashes and specifiers (%) are taken literally.
 
     Raises UnitError for control characters, which not every setting can carry.
     """
@@ -37,19 +37,19 @@ def word(text: str) -> str:
 
 
 def argument(text: str) -> str:
-    """One argument of a command; unlike in `word`, a dollar sign would otherwise name a variable. Raises UnitError."""
+    """Quote one argument of a command: as `word`, and a dollar sign is taken literally too. Raises UnitError."""
     return word(text).replace("$", "$$")
 
 
 def bound(path: str) -> str:
-    """A path of BindReadOnlyPaths=, where a colon separates; raises UnitError."""
+    """Quote a path of BindReadOnlyPaths=, where a colon is the separator; raises UnitError."""
     if ":" in path:
-        raise UnitError(f"{path}: a unit cannot show it to the service because of the colon; move it")
+        raise UnitError(f"{path}: expected a path without a colon, which separates in BindReadOnlyPaths=; move it")
     return word(path)
 
 
 def render(comment: Sequence[str], sections: Mapping[str, Sequence[Setting | str]]) -> str:
-    """The text of a unit: `# comment` lines, then each section's settings; a bare string there is a comment."""
+    """Format a unit: `# comment` lines, then each section's settings; a bare string there is a comment."""
     lines = [f"# {line}" for line in comment]
     for section, settings in sections.items():
         lines += ["", f"[{section}]"]
@@ -61,7 +61,7 @@ def render(comment: Sequence[str], sections: Mapping[str, Sequence[Setting | str
 class ServiceUsers:
     """Users of the two services, each with a group of its own name, and the operators' group.
 
-    The bridge commands the robot, the runner asks it to, operators may stop and arm. Raises UnitError.
+    The bridge commands the robot, the runner commands the bridge, operators may stop and arm. Raises UnitError.
     """
 
     bridge: str = BRIDGE_USER
@@ -82,7 +82,7 @@ class ServiceUsers:
 
 
 def sysusers(users: ServiceUsers) -> str:
-    """Text of a sysusers.d file that makes the services' users and the operators' group."""
+    """Return the sysusers.d file that creates the services' users and the operators' group."""
     return (
         "# Made by edge-install units.\n"
         f'u {users.bridge} - "tic-vla-edge bridge" - -\n'

@@ -1,9 +1,9 @@
-"""systemd units of bridge and runner for one robot and one artifact directory: text from facts, no file is touched.
+"""Formats the systemd units of bridge and runner for one robot and one artifact directory; touches no file.
 
 Two services of two users. The bridge stops the robot and outlives the runner: it starts first, ends last, is restarted
-without end and is the last thing the kernel takes memory from. The runner dies first and its end stops the robot.
-systemd restarts the bridge within seconds, and a runner that waits for an operator; it is the bridge's deadman that
-keeps the promise in milliseconds.
+without limit, and the kernel kills it last when memory runs out. The kernel kills the runner first, and its end stops
+the robot. systemd restarts the bridge, and a runner that waits for an operator, within seconds; the bridge's deadman
+stops the robot within milliseconds.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ FIREWALL_FILE: Final = "tic-vla-edge.nft"
 FIREWALL_FOLDER: Final = Path("/etc/tic-vla-edge")
 SOCKET: Final = Path("/run/tic-vla-edge/bridge.sock")
 LATCH: Final = Path("/var/lib/tic-vla-edge-bridge/emergency-stop")
-"""An emergency stop survives a restart of the bridge and of the machine."""
+"""File that keeps an emergency stop over restarts of the bridge and of the machine."""
 FLIGHT_LOG: Final = f'"{STATE_DIRECTORY}/flight-${{INVOCATION_ID}}.mcap"'
-"""systemd gives every start of a service another invocation id, so no log is in the way of the next one."""
+"""Flight log of one start: systemd gives every start of a service another invocation id."""
 RESTART_STEPS_SINCE: Final = 254
 """First version of systemd with RestartSteps= (its NEWS file)."""
 BRIDGE_MEMORY: Final = "256M"
 RUNNER_MEMORY_SHARE: Final = "75%"
-"""Of the machine's memory, where the target gives none: the rest is left to everything else; a choice of ours."""
+"""Share of the machine's memory for the runner where the target gives none; a choice of ours."""
 WIDEST_PREFIX: Final = 16
 """Shortest prefix of a network that the address filter lets through, bits: a wider one filters hardly anything."""
 HIDDEN: Final = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
-"""Folders that a hardened service does not see: what it needs from there is shown to it, nothing else."""
+"""Folders hidden from a hardened service; units bind only the required files from there."""
 
 _COMPILES: Final = (CUDA, TENSORRT, OPENVINO)
 NEED_DEVICES: Final = (CUDA, TENSORRT)
@@ -47,12 +47,12 @@ NEED_DEVICES: Final = (CUDA, TENSORRT)
 
 @dataclass(frozen=True)
 class ServiceInputs:
-    """All that the units depend on; paths absolute."""
+    """All inputs of the units; paths absolute."""
 
     programs: Path
     """Folder of `edge-bridge` and `edge-run`."""
     python: Path
-    """The interpreter that they run in."""
+    """Their Python interpreter."""
     prefixes: tuple[Path, ...]
     """Folders that Python itself and its packages are read from."""
     robot: Path
@@ -61,35 +61,35 @@ class ServiceInputs:
     artifacts: Path
     engines: Path | None
     trust: Path | None
-    """Public key that has to have signed the artifacts."""
+    """Public key whose signature the artifacts need."""
     instruction: str
     users: ServiceUsers
     interface: str
-    """The robot file's; "lo": the robot is simulated on this machine, no network has to be up and none is filtered."""
+    """The robot file's interface; "lo": a simulated robot on this machine, without network target and filter."""
     domain: int
     """DDS domain."""
     networks: tuple[IPv4Network, ...]
-    """Where the robot is."""
+    """Networks of the robot."""
     own: tuple[IPv4Network, ...]
-    """This machine's addresses on that interface: by them the bridge notices requests of other programs here."""
+    """This machine's addresses on that interface, by which the bridge detects other local programs' requests."""
     nft: Path | None
     """Program that loads the firewall; None: this machine has none."""
     providers: tuple[str, ...]
     """ONNX Runtime's execution providers that the graphs use."""
     devices: tuple[Path, ...]
-    """Device nodes that those need, as found on the machine."""
+    """Device nodes that those providers need, as found on the machine."""
     groups: tuple[str, ...]
-    """Groups that may open them."""
+    """Groups that may open these nodes."""
     memory_bytes: int | None
-    """Memory that the runner may take; None: the target knows its graphics card's only, and a share of the machine's
-    is taken."""
+    """Memory limit of the runner, bytes; None: the target gives its graphics card's only, so the limit is a share of
+    the machine's."""
     control_priority: int
     operator_arm: bool
-    """The robot file wants an operator before every arming; False: the runner arms by itself, by explicit consent."""
+    """Whether every arming needs an operator; False: the runner arms by itself, by explicit consent."""
     bridge_cores: tuple[int, ...]
     """Cores that the target leaves to neither of the runner's threads; empty: any."""
     systemd: int | None
-    """Version of the machine's systemd; None: unknown, and only keys that version 249 knows are written."""
+    """Version of the machine's systemd; None: unknown, so only keys of version 249 are written."""
 
     def __post_init__(self) -> None:
         for name in ("programs", "python", "robot", "artifacts", *(("engines",) if self.engines else ())):
@@ -99,7 +99,7 @@ class ServiceInputs:
             if set(str(program)) & set("'\"\\"):
                 raise UnitError(f"{program}: systemd takes no program with quotes or backslashes in its path; move it")
         if not self.networks:
-            raise UnitError("no network of the robot is known: give it with --network, e.g. 192.168.123.0/24")
+            raise UnitError("the robot's network is unknown: give it with --network, e.g. 192.168.123.0/24")
         for network in collapse_addresses(self.networks):
             check_network(network, "networks")
         if (self.memory_bytes is not None and self.memory_bytes <= 0) or not 0 <= self.control_priority <= 99:
@@ -114,12 +114,12 @@ class ServiceInputs:
 
     @property
     def over_loopback(self) -> bool:
-        """The robot is simulated on this machine."""
+        """Whether the robot is simulated on this machine."""
         return self.interface == "lo"
 
 
 def check_network(network: IPv4Network, source: str) -> None:
-    """Raise UnitError for a network so wide that the filter would mean nothing; loopback never leaves the machine."""
+    """Raise UnitError for a network too wide for a useful filter; loopback never leaves the machine."""
     if network.prefixlen < WIDEST_PREFIX and not network.is_loopback:
         raise UnitError(
             f"{source}: {network} has {network.num_addresses} addresses, expected a prefix of /{WIDEST_PREFIX} or "
@@ -128,7 +128,7 @@ def check_network(network: IPv4Network, source: str) -> None:
 
 
 def bridge_unit(inputs: ServiceInputs) -> str:
-    """Text of the bridge's unit."""
+    """Return the bridge's unit."""
     users = inputs.users
     command = [word(str(inputs.programs / "edge-bridge"))]
     options = ("--robot", str(inputs.robot), "--socket", str(SOCKET), "--latch", str(LATCH))
@@ -185,7 +185,7 @@ def bridge_unit(inputs: ServiceInputs) -> str:
 
 
 def runner_unit(inputs: ServiceInputs) -> str:
-    """Text of the runner's unit."""
+    """Return the runner's unit."""
     engines = () if inputs.engines is None else ("--engines", str(inputs.engines))
     paths = ("--artifacts", str(inputs.artifacts), *engines, "--robot", str(inputs.robot), "--socket", str(SOCKET))
     command = [word(str(inputs.programs / "edge-run")), *(argument(text) for text in paths)]
@@ -259,7 +259,7 @@ def _starting_again(inputs: ServiceInputs) -> list[Setting | str]:
 
 
 def firewall_unit(inputs: ServiceInputs) -> str:
-    """Text of the unit that loads the firewall's file at boot. Raises UnitError without a program that loads it."""
+    """Return the unit that loads the firewall's file at boot. Raises UnitError without a program that loads it."""
     if inputs.nft is None:
         raise UnitError("no program loads the firewall: install nftables")
     nft, file = word(str(inputs.nft)), argument(str(FIREWALL_FOLDER / FIREWALL_FILE))
@@ -289,25 +289,25 @@ def firewall_unit(inputs: ServiceInputs) -> str:
 
 
 def firewall_rules(inputs: ServiceInputs) -> str:
-    """Text of the nftables file; raises UnitError for an interface without a name."""
+    """Return the nftables file; raises UnitError for an interface without a name."""
     users = (inputs.users.bridge, inputs.users.runner)
     return firewall.ruleset(inputs.interface, inputs.networks, inputs.domain, users)
 
 
 def _render(which: str, sections: dict[str, list[Setting | str]]) -> str:
-    comment = [f"Made by edge-install units: the {which} of one robot. Write it anew instead of editing it; see also"]
+    comment = [f"Made by edge-install units: the {which} of one robot. Generate it again, do not edit it; see also"]
     return render([*comment, "systemctl edit, which keeps changes of yours apart."], sections)
 
 
 def _behind_firewall(inputs: ServiceInputs) -> list[Setting | str]:
-    """Wants and not Requires: without its firewall the robot must still have a bridge."""
+    """Return the firewall's dependency: Wants, not Requires, since the robot needs a bridge without firewall too."""
     if inputs.over_loopback or inputs.nft is None:
         return []
     return [("Wants", FIREWALL_UNIT), ("After", FIREWALL_UNIT)]
 
 
 def _back_off(systemd: int | None) -> list[Setting | str]:
-    """Delays between restarts of the bridge: short after a crash, longer while something persistent is wrong."""
+    """Return the delays between restarts of the bridge: short after a crash, longer for a persistent failure."""
     if systemd is None or systemd < RESTART_STEPS_SINCE:
         return [("RestartSec", "1s")]
     return [("RestartSec", "100ms"), ("RestartSteps", "5"), ("RestartMaxDelaySec", "5s")]
@@ -327,7 +327,7 @@ def _ending(*, watchdog_s: int, start_s: int, stop_s: int) -> list[Setting | str
 
 
 def _hardening(inputs: ServiceInputs, needed: Sequence[Path]) -> list[Setting | str]:
-    """What both services give up; `needed`: what they read besides Python."""
+    """Return the restrictions of both services; `needed`: paths that they read besides Python."""
     allowed = dict.fromkeys((*inputs.networks, *inputs.own, firewall.MULTICAST))
     networks = " ".join(str(network) for network in allowed)
     hidden = sorted({str(path) for path in (*inputs.prefixes, *needed) if is_hidden(path)})
@@ -345,7 +345,7 @@ def _hardening(inputs: ServiceInputs, needed: Sequence[Path]) -> list[Setting | 
 
 
 def _confinement() -> list[Setting | str]:
-    """What no service of ours needs."""
+    """Return the restrictions that suit all services."""
     return [
         ("NoNewPrivileges", "yes"),
         ("AmbientCapabilities", ""),
@@ -373,14 +373,14 @@ def _confinement() -> list[Setting | str]:
 
 
 def is_hidden(path: Path) -> bool:
-    """Whether a hardened service does not see it unless it is shown to it."""
+    """Return whether a path is hidden from a hardened service unless it is bound."""
     return any(path.is_relative_to(folder) for folder in HIDDEN)
 
 
 def _accelerator(inputs: ServiceInputs) -> list[Setting | str]:
-    """What the graphs' providers need: nothing on a processor, the device's nodes otherwise."""
+    """Return the device access of the graphs' providers: none on a processor, the device's nodes otherwise."""
     if not set(inputs.providers) & set(_COMPILES):
-        # No PrivateUsers, in which the bridge's user has no number: the runner could not tell it from an impostor.
+        # No PrivateUsers: it hides the bridge's user id, by which the runner recognises an impostor.
         return [("PrivateDevices", "yes"), ("MemoryDenyWriteExecute", "yes")]
     nodes: list[Setting | str] = [("DeviceAllow", f"{word(str(node))} rw") for node in inputs.devices]
     if not nodes and set(inputs.providers) & set(NEED_DEVICES):

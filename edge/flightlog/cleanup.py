@@ -20,9 +20,9 @@ from typing import Final
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, command_line, messages
 
 KEEP_BYTES: Final = 8 * 1024**3
-"""Two recordings at their own bound (edge.flightlog.recorder); a choice of ours."""
+"""Default limit of all logs, bytes: two recordings at their own bound (edge.flightlog.recorder); our choice."""
 KEEP_SHARE: Final = 0.25
-"""Of the file system, where that is less."""
+"""Largest share of the file system, where that is less."""
 KEEP_RUNS: Final = 2
 _PART: Final = re.compile(r"(flight-[A-Za-z0-9_-]+)(?:\.\d{3,})?\.mcap", re.ASCII)
 
@@ -45,7 +45,7 @@ class _Run:
 
 
 def runs(folder: Path) -> list[_Run]:
-    """Recordings in a folder, the one written last first; raises OSError."""
+    """Return the recordings in a folder, newest first; raises OSError."""
     found: dict[str, _Run] = {}
     for path in sorted(folder.iterdir()):
         match, status = _PART.fullmatch(path.name), path.lstat()
@@ -59,11 +59,11 @@ def runs(folder: Path) -> list[_Run]:
 
 
 def clean(folder: Path, keep_bytes: int, keep_runs: int = KEEP_RUNS) -> tuple[list[Path], int]:
-    """Delete what is beyond the total; the files deleted and the bytes left. Raises OSError."""
+    """Delete old recordings beyond the total; return the deleted files and the remaining bytes. Raises OSError."""
     deleted: list[Path] = []
     left = 0
     for number, run in enumerate(runs(folder)):
-        # Once one does not fit, none of the older ones is kept in its place.
+        # After the first recording that does not fit, delete all older ones.
         if number < keep_runs or (not deleted and left + run.size <= keep_bytes):
             left += run.size
             continue
@@ -81,13 +81,13 @@ def parser() -> argparse.ArgumentParser:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument("folder", type=Path, metavar="FOLDER", help="where the flight logs are")
+    p.add_argument("folder", type=Path, metavar="FOLDER", help="folder of the flight logs")
     p.add_argument(
         "--keep-bytes",
         type=int,
         default=KEEP_BYTES,
         metavar="N",
-        help=f"what may stay (default: {KEEP_BYTES}, at most a quarter of the file system)",
+        help=f"limit of all logs (default: {KEEP_BYTES}, at most a quarter of the file system)",
     )
     return p
 

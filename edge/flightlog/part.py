@@ -28,7 +28,7 @@ _NS_PER_S = 1_000_000_000
 
 
 class PartFile:
-    """A file without a buffer of its own that counts what it has taken; pipes and devices will do.
+    """Unbuffered file that counts its written bytes; pipes and devices are allowed.
 
     With `new` it must not exist yet. Raises OSError.
     """
@@ -39,7 +39,7 @@ class PartFile:
         self.length = 0
 
     def write(self, data: bytes) -> int:
-        """Write all of it; a full disk takes a part and then raises OSError."""
+        """Write all bytes; a full disk takes a part and then raises OSError."""
         rest = memoryview(data)
         while rest:
             taken = os.write(self._descriptor, rest)
@@ -54,24 +54,24 @@ class PartFile:
         return self.length
 
     def flush(self) -> None:
-        """Nothing is held back here."""
+        """Do nothing: there is no buffer."""
 
     def sync(self) -> None:
-        """Have the device keep it."""
+        """Sync to the device."""
         try:
             os.fsync(self._descriptor)
         except OSError as error:
-            if error.errno != errno.EINVAL:  # a pipe or a device has nothing to keep
+            if error.errno != errno.EINVAL:  # a pipe or a device cannot sync
                 raise
 
     @property
     def removed(self) -> bool:
-        """Somebody has deleted the file: what is written from now on is lost."""
+        """Whether the file was deleted, so that later writes are lost."""
         return os.fstat(self._descriptor).st_nlink == 0
 
     def close(self) -> None:
-        """Give the descriptor back."""
-        with contextlib.suppress(OSError):  # what mattered was synced before
+        """Close the descriptor."""
+        with contextlib.suppress(OSError):  # the records were synced before
             os.close(self._descriptor)
 
 
@@ -80,7 +80,7 @@ class LogPart:
 
     def __init__(self, file: PartFile, number: int) -> None:
         self.file = file
-        # The writer asks for tell, write and flush only.
+        # The writer uses tell, write and flush only.
         self._writer = Writer(cast(IO[bytes], file), chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._channels: dict[str, int] = {}
         self._sequence: Counter[str] = Counter()
@@ -92,7 +92,7 @@ class LogPart:
         self._writer.add_metadata("part", {"number": str(number)})
 
     def has(self, topic: str) -> bool:
-        """A record of that topic has been added."""
+        """Whether a record of that topic was added."""
         return topic in self._channels
 
     def add(self, topic: str, stamp_ns: int, payload: Payload) -> None:
@@ -109,7 +109,7 @@ class LogPart:
         self._writer.add_message(channel, stamp_ns, data, publish_time=stamp_ns, sequence=sequence)
 
     def flush(self) -> None:
-        """Close the chunk and have the device keep it: whatever dies, it can be read."""
+        """Close the chunk and sync it, so that it survives the process and the machine."""
         self._writer.flush()
         self.file.sync()
 
@@ -122,13 +122,13 @@ class LogPart:
 def encode(payload: Payload, stamp_ns: int) -> bytes:
     """Payload as UTF-8 JSON; JPEG bytes become a `foxglove.CompressedImage`.
 
-    JSON has no NaN or infinity: a non-finite number is written as null (a bad model output is what one most wants
-    to find in a log). Raises TypeError or ValueError for what JSON cannot hold and for a stamp that is none.
+    JSON has no NaN or infinity: a non-finite number is written as null, so that a log can show a bad model output.
+    Raises TypeError or ValueError for values outside JSON and for an invalid stamp.
     """
     if not 0 <= operator.index(stamp_ns) < 2**63:
         raise ValueError(f"stamp must be monotonic ns, found {stamp_ns}")
     if isinstance(payload, bytes):
-        # Put together as bytes: a picture sent through the JSON encoder would hold the interpreter for its length.
+        # Assembled as bytes: encoding a picture as JSON would block the interpreter.
         time_ = f'{{"sec": {stamp_ns // _NS_PER_S}, "nsec": {stamp_ns % _NS_PER_S}}}'
         head = f'{{"timestamp": {time_}, "frame_id": "camera", "format": "jpeg", "data": "'
         return b"".join((head.encode(), base64.b64encode(payload), b'"}'))

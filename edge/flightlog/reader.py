@@ -19,21 +19,21 @@ from mcap.stream_reader import CRCValidationError, StreamReader
 _MAGIC = b"\x89MCAP0\r\n"
 _RECORD_LIMIT_BYTES = 256 * 1024 * 1024
 
-# What the MCAP reader raises at a cut: too few bytes for a number, a string, a compressed block, or a bad checksum.
+# Errors of the MCAP reader at a cut: too few bytes for a number, a string, a compressed block, or a bad checksum.
 _CUT = (McapError, CRCValidationError, struct.error, zstandard.ZstdError, UnicodeDecodeError, MemoryError)
 
 
 class RecordingError(ValueError):
-    """The file is not a flight log at all."""
+    """The file is not a flight log."""
 
 
 def part_path(path: Path, number: int) -> Path:
-    """Where part `number` (from 1) of the recording at `path` lies: `flight.mcap`, `flight.002.mcap`, …"""
+    """Return the path of part `number` (from 1) of a recording: `flight.mcap`, `flight.002.mcap`, …"""
     return path if number == 1 else path.with_name(f"{path.stem}.{number:03d}{path.suffix}")
 
 
 def parts(path: Path) -> list[Path]:
-    """`path` and those of its continuations that exist, in order; middle ones may have been discarded."""
+    """Return `path` and its existing continuations, in order; middle ones may have been discarded."""
     pattern = re.compile(rf"{re.escape(path.stem)}\.(\d{{3,}}){re.escape(path.suffix)}", re.ASCII)
     found: list[tuple[int, Path]] = []
     if path.parent.is_dir():

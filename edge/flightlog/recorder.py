@@ -1,16 +1,16 @@
-"""Flight recorder: what the runner saw, decided and commanded, as MCAP files written by a thread of its own.
+"""Flight recorder: the runner's inputs, decisions and commands as MCAP files, written by a separate thread.
 
-The control thread must never wait for a disk. `Recorder.put` therefore only appends to a bounded queue, without a lock
-(a writer thread that the scheduler has put aside would keep it); everything that can be slow or can fail — JSON,
-compression, write, fsync — happens in the writer thread. What the queue cannot hold is dropped and counted by topic.
+The control thread must never wait for a disk. `Recorder.put` therefore only appends to a bounded queue, without a lock,
+which a preempted writer thread could hold. All slow or fallible work (JSON, compression, write, fsync) happens in the
+writer thread. Records beyond the queue's length are dropped and counted by topic.
 
-On disk a recording is bounded too. It is written in parts (`flight.mcap`, `flight.002.mcap`, …), each a whole MCAP that
-begins with the `/run` record; beyond `total_bytes` the oldest part but the first is deleted, so that how the run began
-and how it ended are kept. While the file system has less than `free_bytes` left nothing is written (`error` names it)
-and what comes is dropped and counted; a write error ends the recording.
+On disk a recording is bounded too. It consists of parts (`flight.mcap`, `flight.002.mcap`, …), each a whole MCAP that
+begins with the `/run` record. Beyond `total_bytes` the oldest part except the first is deleted, so the beginning and
+the end of the run are kept. While the file system has less than `free_bytes` left, nothing is written (`error` names
+it) and records are dropped and counted. A write error ends the recording.
 
-A chunk is closed and handed to the device at least once a second, so a process killed in the middle loses at most the
-last second (read such a file with `edge.flightlog.reader.read_messages`).
+A chunk is closed and synced at least once a second, so a killed process loses at most the last second (read such a file
+with `edge.flightlog.reader.read_messages`).
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from edge.flightlog.part import LogPart, PartFile, Payload, encode
 from edge.flightlog.reader import part_path, parts
 
 ARMING_FREE_SHARE = 0.07
-"""Fault matrix row 51: a robot that records is not armed with less of its file system free (openpilot's figure)."""
-_FLUSH_PERIOD_NS = 900_000_000  # below one second even when a pass of the loop is late
-_POLL_S = 0.05  # the writer polls, so that a caller never pays for waking it
+"""Free share of the file system below which a recording robot is not armed (fault matrix row 51; openpilot)."""
+_FLUSH_PERIOD_NS = 900_000_000  # less than one second even when a pass of the loop is late
+_POLL_S = 0.05  # the writer polls, so that no caller has to wake it
 _PART_AGE_NS = 300 * 1_000_000_000
-"""The index of a part is kept in memory until it is finished, 1 KiB a second: what five minutes take is used again."""
+"""Duration of a part, which bounds the memory of its index: 1 KiB a second, kept until the part is finished."""
 _NICENESS = 10
 _RESUME = 1.25
-"""A paused recording goes on once there is this many times the floor: not on and off with every flush."""
+"""Multiple of the floor at which a paused recording resumes, so that it does not switch with every flush."""
 _RUN_TOPIC = "/run"
 
 _Item = tuple[str, int, Payload]
@@ -44,16 +44,16 @@ _Item = tuple[str, int, Payload]
 
 @dataclass(frozen=True)
 class RecorderLimits:
-    """What a recording may take of memory and disk."""
+    """Memory and disk limits of a recording."""
 
     records: int = 4096
-    """Queue length: more than a minute of everything that a run records."""
+    """Queue length: more than a minute of all records of a run."""
     picture_bytes: int = 64 * 1024 * 1024
-    """Pictures in the queue."""
+    """Largest number of pictures in the queue."""
     part_bytes: int = 256 * 1024 * 1024
     total_bytes: int = 4 * 1024 * 1024 * 1024
     free_bytes: int = 512 * 1024 * 1024
-    """What is left free for everything else on that file system."""
+    """Space left free for other programs on that file system."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -84,7 +84,7 @@ class Recorder:
         self._picture_bytes_in = 0  # by `put`
         self._picture_bytes_out = 0
         self._ended = False
-        # Between the writer and readers of its counts; `put` never takes it.
+        # Lock between the writer and readers of its counts; `put` never takes it.
         self._lock = threading.Lock()
         self._lost: Counter[str] = Counter()
         self._unsaved: Counter[str] = Counter()  # taken from the queue since the last flush
@@ -104,23 +104,23 @@ class Recorder:
         except OSError as error:
             self._ended = True
             self._error = f"cannot open {self.path} for recording: {error.strerror or error}"
-        # A daemon: a disk that hangs for good must not keep the process from ending.
+        # A daemon thread: a disk that hangs must not keep the process alive.
         self._thread = threading.Thread(target=self._run, args=(file,), name="recorder", daemon=True)
         if file is not None:
             self._thread.start()
 
     @property
     def error(self) -> str | None:
-        """Why nothing is written (any more, or just now), in one line, or None while it works."""
+        """Reason why nothing is written, in one line; None while recording works."""
         with self._lock:
             return self._error or self._paused
 
     @property
     def dropped(self) -> dict[str, int]:
-        """Records per topic that were given to `put` and are not known to be on disk.
+        """Records per topic that were passed to `put` and may not be on disk.
 
-        While `error` is None that is what was refused or could not be encoded. An error adds what was queued and
-        what was written since the last flush, of which the file may still hold a part: never fewer than are missing.
+        While `error` is None these were refused or not encodable. An error adds the queued records and those written
+        since the last flush, some of which the file may contain: the count is never too low.
         """
         with self._lock:
             counts = Counter(self._refused.copy()) + self._lost
@@ -130,7 +130,7 @@ class Recorder:
         return dict(counts)
 
     def statistics(self) -> dict[str, Any]:
-        """For a run's result: what was dropped and why, and what lies on disk."""
+        """Return for a run's result: dropped records with the reason, and the files on disk."""
         part = self._part
         with self._lock:
             written = sum(size for _, size in self._finished) + (0 if part is None else part.file.length)
@@ -140,8 +140,8 @@ class Recorder:
     def put(self, topic: str, stamp_ns: int, payload: Payload) -> None:
         """Queue one record; never blocks, never raises, encodes nothing.
 
-        `payload` is a mapping that JSON can hold (numpy values allowed) and that no thread changes afterwards, or
-        the bytes of a JPEG, which become a `foxglove.CompressedImage`.
+        `payload` is a JSON mapping (numpy values allowed) that no thread changes afterwards, or the bytes of a JPEG,
+        which become a `foxglove.CompressedImage`.
         """
         size = len(payload) if isinstance(payload, bytes) else 0
         limits = self._limits
@@ -156,7 +156,7 @@ class Recorder:
         self._queue.append((topic, stamp_ns, payload))
 
     def close(self, timeout_s: float = 5.0) -> bool:
-        """Write what is queued, finish the file and return whether all of it is on disk in time."""
+        """Write the queue, finish the file and return whether all records are on disk in time."""
         self._ended = True
         self._closing.set()
         if self._thread.ident is not None:
@@ -201,7 +201,7 @@ class Recorder:
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
         try:
             self._write_all(self._begin(file))
-        except Exception as error:  # noqa: BLE001 - a thread that ends must always give the reason in `error`
+        except Exception as error:  # noqa: BLE001 - `error` must always give the reason for the thread's end
             reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
             self._fail(f"recording to {self.path} stopped: {reason or type(error).__name__}")
         finally:
@@ -221,7 +221,7 @@ class Recorder:
         self._check_space()
         begun_ns = flushed_ns = time.monotonic_ns()
         while True:
-            # Asked before the queue is emptied: whatever was put before close() is then written.
+            # Read before the queue is emptied, so that all records from before close() are written.
             closing = self._closing.is_set()
             while (item := self._take()) is not None:
                 self._write(part, item)
@@ -250,7 +250,7 @@ class Recorder:
         topic, stamp_ns, payload = item
         try:
             if topic == _RUN_TOPIC:
-                encode(payload, stamp_ns)  # it is kept to begin every part with, so it must be sound
+                encode(payload, stamp_ns)  # every part begins with it, so it must be encodable
                 self._run_item = item
             if self._paused is not None:
                 self._drop_taken(topic)
@@ -259,7 +259,7 @@ class Recorder:
                 part.add(*self._run_item)
             part.add(*item)
         except (TypeError, ValueError, RecursionError):
-            # One record JSON cannot hold must not end the recording of all others.
+            # One record outside JSON must not end the recording of all others.
             self._drop_taken(topic)
 
     def _next_part(self, part: LogPart) -> LogPart:
@@ -279,7 +279,7 @@ class Recorder:
         return self._begin(PartFile(part_path(self.path, self._number), new=True))
 
     def _check_space(self) -> None:
-        """Pause below the floor; go on once there is clearly more."""
+        """Pause below the floor; resume once there is clearly more space."""
         floor = self._limits.free_bytes
         free = _free(self.path)
         if free is None or free[0] >= floor * (_RESUME if self._paused else 1):
@@ -294,7 +294,7 @@ class Recorder:
 
 
 def space_refusal(path: Path, limits: RecorderLimits | None = None) -> str | None:
-    """Why a robot that is to record to `path` must not be armed (fault matrix row 51); None: it may."""
+    """Return why a robot that records to `path` must not be armed (fault matrix row 51); None: it may."""
     free = _free(path)
     if free is None:
         return None
@@ -308,7 +308,7 @@ def space_refusal(path: Path, limits: RecorderLimits | None = None) -> str | Non
 
 
 def _free(path: Path) -> tuple[int, int] | None:
-    """Bytes free to us, and in all, of the file system that holds `path`; None where it cannot be read."""
+    """Return the free and total bytes of the file system of `path`; None where it cannot be read."""
     try:
         found = os.statvfs(path.parent)
     except OSError:

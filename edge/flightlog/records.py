@@ -15,7 +15,7 @@ from firmware_bridge.core.robot_state import BatteryState, RobotState
 
 
 class Throttle:
-    """Lets one in a period pass; for one thread."""
+    """Rate limiter: one record per period; for one thread."""
 
     def __init__(self, rate_hz: float) -> None:
         if not 0 < rate_hz <= 1000:
@@ -24,10 +24,10 @@ class Throttle:
         self._due_ns = 0
 
     def due(self, now_ns: int) -> bool:
-        """Whether one is due now; if so, the next one is a period later."""
+        """Return whether a record is due now; if so, schedule the next one a period later."""
         if now_ns < self._due_ns:
             return False
-        # On the grid while it is kept up with, so that a source a little faster than the rate is not halved.
+        # Keep the time grid where possible, so that a source slightly faster than the rate is not halved.
         self._due_ns = max(self._due_ns + self._period_ns, now_ns + self._period_ns // 2)
         return True
 
@@ -39,7 +39,7 @@ def odometry_record(
     drift: DriftRate | None,
     command: tuple[float, float, float] | None,
 ) -> dict[str, Any]:
-    """`/odometry`: what the robot reported, what was made of it, and the last commanded velocity."""
+    """Return the `/odometry` record: the report, the fused pose, and the last commanded velocity."""
     rad_per_m = None if drift is None else drift.rad_per_m
     return {
         "raw_pose": state.T_odom_base,
@@ -57,5 +57,5 @@ def odometry_record(
 
 
 def battery_record(battery: BatteryState) -> dict[str, Any]:
-    """`/battery`: charge, voltage and current as the robot reports them."""
+    """Return the `/battery` record: charge, voltage and current as the robot reports them."""
     return {"soc_percent": battery.soc_percent, "voltage_v": battery.voltage_v, "current_a": battery.current_a}

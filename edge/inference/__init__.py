@@ -1,1 +1,1 @@
-"""Runs the exported graphs: sessions and engines, the policy of a tick, the language model of a generation."""
+"""Runs the exported graphs: sessions, engines, the policy of a tick, the language model of a generation."""

@@ -1,7 +1,7 @@
 """Engines of TensorRT and OpenVINO: built ahead of time on the device, checked before control starts.
 
-A provider that compiles would otherwise do so at the first run, for minutes and without a word. Here every graph that
-needs an engine gets one in a folder of its own; `engines.json` lists what it depends on and the hash of each file.
+Otherwise a compiling provider would compile at the first run, for minutes and without a message. Every graph that needs
+an engine gets one in its own folder; `engines.json` lists the engine's inputs and the hash of each file.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ Progress = Callable[[str], None]
 
 
 class EngineError(ValueError):
-    """An engine that is missing, is another device's, or cannot be built; its text is the one line to show."""
+    """An engine is missing, was built for another device, or cannot be built; the message is one line."""
 
 
 class Runnable(Protocol):
@@ -55,7 +55,7 @@ class Runnable(Protocol):
 
 @dataclass(frozen=True)
 class Machine:
-    """The device and ONNX Runtime as this module meets them; tests give others."""
+    """Access to the device and ONNX Runtime; tests replace it."""
 
     facts: Callable[[str], DeviceFacts] = read_device
     providers: Callable[[], list[str]] = available_providers
@@ -65,13 +65,13 @@ class Machine:
 
 @dataclass(frozen=True)
 class VerifiedEngines:
-    """Engine files as they were before their hashes were compared; empty where no graph needs an engine."""
+    """Identities of the engine files from before the comparison of their hashes; empty without engines."""
 
     identities: Mapping[Path, Mapping[str, FileIdentity]]
     """Files of each engine's folder."""
 
     def check_unchanged(self) -> None:
-        """Raise EngineError if a file is not the verified one any more: call it when the graphs have been opened."""
+        """Raise EngineError if a file has changed since its verification; call it after the graphs are opened."""
         for folder, before in self.identities.items():
             after = _identities(folder)
             for file in sorted({*before, *after}):
@@ -80,17 +80,17 @@ class VerifiedEngines:
 
 
 def default_directory(artifacts: Path) -> Path:
-    """Where the engines of an artifact directory are by default: beside it, as it is sealed."""
+    """Return the default folder of an artifact directory's engines: beside it, because it is sealed."""
     return artifacts.with_name(artifacts.name + ".engines")
 
 
 def needed(artifacts: Artifacts) -> list[str]:
-    """Graphs that need an engine."""
+    """Return the names of the graphs that need an engine."""
     return [name for name, graph in artifacts.graphs.items() if graph.session.engine]
 
 
 def with_engines(artifacts: Artifacts, directory: Path) -> Artifacts:
-    """The artifacts with every session that needs an engine pointed at its folder; raises EngineError."""
+    """Return the artifacts with the sessions' engine folders set; raises EngineError."""
     graphs = dict(artifacts.graphs)
     for name in needed(artifacts):
         graphs[name] = _redirected(artifacts, name, directory / name)
@@ -110,7 +110,7 @@ def _redirected(artifacts: Artifacts, name: str, folder: Path) -> Any:
 
 
 def engine_inputs(artifacts: Artifacts, name: str, machine: Machine) -> dict[str, Any]:
-    """All that an engine depends on; its hash is the engine's key."""
+    """Return all inputs of an engine; their hash is the engine's key."""
     graph = artifacts.graphs[name]
     listed = read_manifest(artifacts.directory)["files"]
     return {
@@ -127,9 +127,9 @@ def key_of(inputs: Mapping[str, Any]) -> str:
 
 
 def check(artifacts: Artifacts, directory: Path, machine: Machine | None = None) -> VerifiedEngines:
-    """Verify every engine needed; returns what detects a file that changes afterwards.
+    """Verify every required engine; return a detector of files that change afterwards.
 
-    Raises EngineError, naming the command that helps, unless every engine is there and this device's own.
+    Raises EngineError with the command to run, unless every engine is present and was built for this device.
     """
     machine = machine or Machine()
     names = needed(artifacts)
@@ -149,7 +149,7 @@ def check(artifacts: Artifacts, directory: Path, machine: Machine | None = None)
 
 
 def _wrong(artifacts: Artifacts, name: str, directory: Path, entry: Any, machine: Machine) -> str | None:
-    """Return what is wrong with an engine, for a message; None if nothing is."""
+    """Return an engine's defect, for a message; None for a valid engine."""
     if not isinstance(entry, dict):
         return f"has no engine in {directory}"
     inputs = engine_inputs(artifacts, name, machine)
@@ -172,7 +172,7 @@ def _wrong(artifacts: Artifacts, name: str, directory: Path, entry: Any, machine
 
 
 def _read(directory: Path) -> dict[str, Any]:
-    """Entries of engines.json; none if there is no such file or it is damaged."""
+    """Return the entries of engines.json; empty for a missing or damaged file."""
     path = directory / ENGINES_NAME
     try:
         if path.stat().st_size > MAX_BYTES:
@@ -187,7 +187,7 @@ def _read(directory: Path) -> dict[str, Any]:
 
 
 def _hashes(folder: Path) -> dict[str, str]:
-    """Hash of every file of an engine's folder but timing caches, which later builds may add to; raises OSError."""
+    """Hash every file of an engine's folder except timing caches, which later builds may extend; raises OSError."""
     hashes: dict[str, str] = {}
     for path in sorted(p for p in folder.rglob("*") if p.is_file() and p.suffix != TIMING_SUFFIX):
         digest = hashlib.sha256()
@@ -199,16 +199,16 @@ def _hashes(folder: Path) -> dict[str, str]:
 
 
 def _identities(folder: Path) -> dict[str, FileIdentity]:
-    """What changes when a compiled file is written again, even with the same bytes; none without the folder."""
+    """Return the identities of compiled files, which change on every write; empty without the folder."""
     files = (path for path in folder.rglob("*") if path.is_file() and path.suffix not in (TIMING_SUFFIX, ".profile"))
     return {path.relative_to(folder).as_posix(): FileIdentity.from_stat(path.stat()) for path in files}
 
 
 def build(artifacts: Artifacts, directory: Path, say: Progress, machine: Machine | None = None) -> dict[str, Any]:
-    """Build every engine that is missing or another device's; returns per graph whether it was built and how long.
+    """Build every missing or foreign engine; return per graph whether it was built and the time, s.
 
-    Each engine is built aside and renamed, and `engines.json` is written after each: an interrupted build goes on where
-    it stopped. Raises EngineError, ArtifactError or OSError.
+    Each engine is built in a temporary folder and renamed, then `engines.json` is written: an interrupted build resumes
+    where it stopped. Raises EngineError, ArtifactError or OSError.
     """
     machine = machine or Machine()
     names = needed(artifacts)
@@ -249,7 +249,7 @@ def _write(directory: Path, entries: Mapping[str, Any]) -> None:
 
 
 def _build_one(artifacts: Artifacts, name: str, directory: Path, machine: Machine) -> dict[str, str]:
-    """Build one engine, then open it again from where the runner will: nothing may be compiled that time."""
+    """Build one engine, then reopen it from the runner's path; the second opening must not compile."""
     partial, final = directory / f"{name}.partial", directory / name
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir()
@@ -268,7 +268,7 @@ def _build_one(artifacts: Artifacts, name: str, directory: Path, machine: Machin
     identities = _identities(final)
     _open_and_run(artifacts, name, final, machine)
     after = _hashes(final)
-    # Compiling again may give the very same bytes: the file's identity changes all the same.
+    # A second compilation may give the same bytes, but the file's identity changes.
     rewritten = {file for file, found in _identities(final).items() if identities.get(file) != found}
     changed = sorted(rewritten | {file for file in {*built, *after} if built.get(file) != after.get(file)})
     if changed:
@@ -295,7 +295,7 @@ def _open_and_run(artifacts: Artifacts, name: str, folder: Path, machine: Machin
 def profile_shapes(
     inputs: Sequence[TensorContract], options: Mapping[str, str], name: str
 ) -> list[dict[str, tuple[int, ...]]]:
-    """Shapes of all inputs at each profile in a session's options; one set without free axes. Raises EngineError."""
+    """Return all input shapes at each profile of a session's options; one set without free axes. Raises EngineError."""
     free = {t.name: len(t.shape) for t in inputs if any(isinstance(axis, str) for axis in t.shape)}
     fixed = {t.name: tuple(axis for axis in t.shape if isinstance(axis, int)) for t in inputs if t.name not in free}
     if not free:
@@ -316,7 +316,7 @@ def profile_shapes(
 
 
 def _check_profiles(artifacts: Artifacts, names: Sequence[str]) -> None:
-    """Raise EngineError if a generation could give an engine more than it is built for."""
+    """Raise EngineError if a generation could exceed the shapes that an engine is built for."""
     context = artifacts.runtime.max_context
     for name in names:
         graph = artifacts.graphs[name]
@@ -332,7 +332,7 @@ def _check_profiles(artifacts: Artifacts, names: Sequence[str]) -> None:
 
 @contextmanager
 def _busy(say: Progress, line: str) -> Iterator[None]:
-    """Report at intervals that a build goes on: a compiler prints nothing for minutes."""
+    """Report at intervals that a build continues: a compiler prints nothing for minutes."""
     done = threading.Event()
     started_ns = time.monotonic_ns()
 

@@ -1,6 +1,6 @@
 """The work of one generation: its frames, its prompt, its result, and the semantic state that the result becomes.
 
-The robot's reasoning thread and the benchmark's virtual time do this work alike; when each part happens is theirs.
+The robot's reasoning thread and the benchmark's virtual time share this work; each decides when a part runs.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from edge.inference.language import ContextOverflowError, Generation, Generation
 from edge.inference.policy import Policy
 from edge.reasoning.decoding_rules import DecodingContext, TextConstraint
 from edge.reasoning.instruction_state import Job
-from edge.reasoning.path_memory import Way
+from edge.reasoning.path_memory import PastPath
 from edge.reasoning.prompt import format_before
 from edge.state.reasoning_text import Waypoints, parse_waypoints
 from edge.state.ring import EncodedFrame, TokenRing
@@ -60,7 +60,7 @@ class GenerationTask:
         """Frames before the anchor, oldest first."""
         self.anchor: EncodedFrame | None = None
         """The newest frame."""
-        self._way: Way = ()
+        self._past_path: PastPath = ()
         self._context = DecodingContext()
 
     def prefill(self, run: GenerationRun, number: int, frame: EncodedFrame) -> None:
@@ -68,9 +68,9 @@ class GenerationTask:
         run.feed([self._models.language.prompt.frame(number, frame, self.job.instruction)])
 
     def set_anchor(self, anchor: EncodedFrame, ring: TokenRing) -> None:
-        """Take the newest frame, and what is remembered of the instruction up to its capture."""
+        """Set the newest frame, and read the instruction's memory up to its capture."""
         self.anchor = anchor
-        self._way, self._context = self.job.memory.way(ring, anchor), self.job.memory.context(anchor)
+        self._past_path, self._context = self.job.memory.past_path(ring, anchor), self.job.memory.context(anchor)
 
     def finish(
         self,
@@ -88,7 +88,7 @@ class GenerationTask:
         prompt = language.prompt
         rest = [
             prompt.frame(len(self.older) + 1, self.anchor, self.job.instruction),
-            prompt.tail(self._way, self._context.before),
+            prompt.tail(self._past_path, self._context.before),
         ]
         constraint = language.constraint(self._context)
         generation = run.finish(rest, max_new_tokens=self.max_new_tokens, constraint=constraint)
@@ -99,7 +99,7 @@ class GenerationTask:
         return GenerationResult(generation, constraint, context, parse_waypoints(generation.text))
 
     def publish(self, result: GenerationResult, *, number: int, ready_ns: int, text_complete: bool) -> SemanticState:
-        """The semantic state of a result that the robot will drive by; its text is remembered for the next one."""
+        """Return the semantic state of a result that will drive the robot; store its text for the next generation."""
         assert self.anchor is not None
         self.job.memory.update(result.generation.text, result.constraint, self.anchor)
         return SemanticState(
@@ -116,10 +116,10 @@ class GenerationTask:
         )
 
     def record(self, result: GenerationResult) -> dict[str, Any]:
-        """What a log keeps of the prompt and the result; call it after `publish`."""
+        """Return the log record of prompt and result; call it after `publish`."""
         stop = self.job.memory.stop
         return {
-            "way": self._way,
+            "way": self._past_path,
             "before": format_before(self._context.before),
             **self._context.record(),
             "overruled": result.constraint.overruled,

@@ -1,4 +1,4 @@
-"""One ONNX graph in ONNX Runtime, opened from verified bytes and held to its contract."""
+"""Opens one ONNX graph in ONNX Runtime from verified bytes and checks it against its contract."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ class Interrupt:
 
 
 class Binding:
-    """Buffers that a graph reads and writes; the arrays behind them are the caller's to keep alive.
+    """Buffers that a graph reads and writes; the caller keeps their arrays alive.
 
-    On an accelerator an input is copied to it when it is bound, which can fail there as a run can: with a GraphError.
+    Binding copies an input to an accelerator, which can fail like a run: with a GraphError.
     """
 
     def __init__(self, graph: str, buffers: ort.IOBinding) -> None:
@@ -75,10 +75,10 @@ class Binding:
 
 
 class Graph:
-    """A session on the execution provider and with the threads that the manifest, or an argument, names.
+    """A session with the execution provider and threads of the manifest, or of an argument.
 
-    Opened from the bytes whose hash was checked, so a file that changes meanwhile cannot be run. Weights in data files
-    are mapped, not read; the files' identity is checked again once the session holds them.
+    It is opened from the bytes whose hash was checked, so a file that changes meanwhile cannot run. Weights in data
+    files are mapped, not read; the files' identity is checked again once the session has opened them.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class Graph:
         provider: str | None = None,
         cores: Collection[int] = (),
     ) -> None:
-        """`cores`: where the session's own worker threads may run; empty: where the opening thread may."""
+        """`cores`: cores of the session's worker threads; empty: those of the opening thread."""
         contract = artifacts.graphs[name]
         options = ort.SessionOptions()
         options.intra_op_num_threads = threads or contract.session.threads or 1
@@ -100,11 +100,11 @@ class Graph:
             affinities = ";".join([worker] * (options.intra_op_num_threads - 1))
             options.add_session_config_entry("session.intra_op_thread_affinities", affinities)
         options.inter_op_num_threads = 1
-        # A spinning worker would take the core that the other thread needs.
+        # A spinning worker would occupy the other thread's core.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         options.log_severity_level = 3
-        # Opened from bytes, a graph would read external weights from the working directory: it may read them from its
-        # own directory if the manifest lists them, and from a folder that is not there if it lists none.
+        # A graph opened from bytes would read external weights from the working directory. It may read them from its
+        # own directory if the manifest lists them; otherwise point it at a folder that does not exist.
         weights = artifacts.directory if contract.data_files else artifacts.directory / "no-external-data"
         options.add_session_config_entry("session.model_external_initializers_file_folder_path", str(weights))
         self.provider = provider or contract.session.provider
@@ -125,7 +125,7 @@ class Graph:
         artifacts.check_unchanged(contract.data_files)
         opened = self._session.get_providers()[0]
         if opened != self.provider:
-            # A provider whose libraries do not load is replaced by the CPU's with no more than a line in the log.
+            # ONNX Runtime replaces a provider whose libraries do not load by the CPU's, with one line in the log.
             raise ArtifactError(
                 f"{contract.file}: ONNX Runtime opened it on {opened} instead of {self.provider}, whose libraries are "
                 f"missing or do not load; install those that its package names"
@@ -145,13 +145,13 @@ class Graph:
 
     @property
     def device(self) -> str:
-        """Where the graph's large buffers belong, by ONNX Runtime's name: `cpu` or `cuda`."""
+        """Device of the graph's large buffers, by ONNX Runtime's name: `cpu` or `cuda`."""
         return _DEVICES.get(self.provider, "cpu")
 
     def run(
         self, feeds: Mapping[str, Array], outputs: Sequence[str] | None = None, interrupt: Interrupt | None = None
     ) -> list[Array]:
-        """Outputs (all, or those named) for named inputs; raises GraphError, or CancelledError when interrupted."""
+        """Return outputs (None: all) for named inputs; raises GraphError, or CancelledError when interrupted."""
         try:
             result: list[Array] = self._session.run(outputs, feeds, interrupt.options if interrupt else None)
         except Exception as error:
@@ -159,7 +159,7 @@ class Graph:
         return result
 
     def binding(self) -> Binding:
-        """A new set of bound buffers for `run_bound`."""
+        """Return a new set of bound buffers for `run_bound`."""
         return Binding(self.name, self._session.io_binding())
 
     def run_bound(self, binding: Binding, interrupt: Interrupt | None = None) -> None:
@@ -176,6 +176,6 @@ class Graph:
 
 
 def zeros(contract: TensorContract, **axes: int) -> Array:
-    """A buffer of zeros in a tensor's shape, its free axes as given."""
+    """Return a buffer of zeros in a tensor's shape with the given free axes."""
     shape = [axis if isinstance(axis, int) else axes[axis] for axis in contract.shape]
     return np.zeros(shape, dtype=DTYPES[contract.dtype])

@@ -1,4 +1,4 @@
-"""The slow half of the model: prefill in chunks, then greedy decoding, stoppable between any two calls and in one."""
+"""The slow half of the model: prefill in chunks, then greedy decoding; it can stop between and within calls."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from edge.core.geometry import SE2
 from edge.inference.graph import DTYPES, CancelledError, Graph, Interrupt, zeros
 from edge.inference.scheduling import Schedule, run_as
 from edge.reasoning.decoding_rules import DecodingContext, TextConstraint
-from edge.reasoning.prompt import LONGEST_BEFORE, LONGEST_WAY, InstructionError, PromptBuilder, PromptIds, Segment
+from edge.reasoning.prompt import LONGEST_BEFORE, LONGEST_PAST_PATH, InstructionError, PromptBuilder, PromptIds, Segment
 from edge.state.reasoning_text import MAX_TEXT_CHARS
 from edge.state.ring import EncodedFrame
 
@@ -34,7 +34,7 @@ class Generation:
 
     text: str
     last_layer_kv: Floats
-    """K‖V of the last layer for every token that was fed, [1, T, kv_dim]."""
+    """K‖V of the last layer for every input token, [1, T, kv_dim]."""
     token_ids: tuple[int, ...]
     """The new tokens."""
     prompt_tokens: int
@@ -53,13 +53,13 @@ class Chunk:
 
     ids: tuple[int, ...]
     tokens: Floats | None
-    """Visual tokens of the frame whose places are among the ids, if there is one."""
+    """Visual tokens of the frame whose placeholders are among the ids; None without a frame."""
     image_offset: int
-    """How many of that frame's places earlier chunks have filled."""
+    """Number of that frame's placeholders that earlier chunks have filled."""
 
 
 def chunks(segments: Sequence[Segment], *, size: int, image_id: int) -> list[Chunk]:
-    """Cut segments into calls of at most `size` tokens; a frame may be cut anywhere."""
+    """Split segments into calls of at most `size` tokens; a frame may be split anywhere."""
     result: list[Chunk] = []
     for segment in segments:
         filled = 0
@@ -72,7 +72,7 @@ def chunks(segments: Sequence[Segment], *, size: int, image_id: int) -> list[Chu
 
 
 def set_last_apart(prompt: Sequence[Chunk]) -> list[Chunk]:
-    """The same prompt with its last token, which is text, in a chunk of its own."""
+    """Return the same prompt with its last token, which is text, in a separate chunk."""
     *head, tail = prompt
     last = Chunk(tail.ids[-1:], None, 0)
     return [*head, *([Chunk(tail.ids[:-1], tail.tokens, tail.image_offset)] if tail.ids[:-1] else []), last]
@@ -161,11 +161,11 @@ class LanguageModel:
     def check_instruction(self, instruction: str) -> None:
         """Raise InstructionError unless a prompt with all frames and a full answer fit the model's context.
 
-        The prompt is taken at its longest: with all points of a way that leads far off, and a long progress.
+        The check uses the longest prompt: all points of a far path, and a long progress.
         """
         frames = range(len(self.runtime.frame_offsets_s))
         filler = [EncodedFrame(i, SE2(0.0, 0.0, 0.0), self._no_frame) for i in frames]
-        prompt = self.prompt.build(filler, instruction, LONGEST_WAY, LONGEST_BEFORE)
+        prompt = self.prompt.build(filler, instruction, LONGEST_PAST_PATH, LONGEST_BEFORE)
         needed = sum(len(segment.ids) for segment in prompt)
         room = self.runtime.max_context - self.runtime.max_new_tokens
         if needed > room:
@@ -174,7 +174,7 @@ class LanguageModel:
             )
 
     def constraint(self, context: DecodingContext) -> TextConstraint:
-        """Return what constrains one generation's text to a context."""
+        """Return the constraint of one generation's text by a context."""
         return TextConstraint(context, lambda text: self._tokenizer.encode(text, add_special_tokens=False).ids)
 
     def generate(
@@ -195,7 +195,7 @@ class LanguageModel:
         interrupt: Interrupt | None = None,
         before_call: Callable[[int], None] | None = None,
     ) -> GenerationRun:
-        """A generation whose prompt is given piece by piece; the one before it must be over: they share buffers.
+        """Begin a generation whose prompt is fed in parts; the previous one must be over: they share buffers.
 
         `cancelled` is called before every call of a graph, `interrupt` can end one under way, and `before_call` takes
         the expected duration of the next call, ns.
@@ -203,30 +203,30 @@ class LanguageModel:
         return GenerationRun(self, cancelled, interrupt, before_call)
 
     def run(self, call: Call, chunk: Chunk, past: int, interrupt: Interrupt | None) -> int:
-        """Feed a chunk after `past` tokens; the id after it (0 from a graph that chooses none)."""
+        """Feed a chunk after `past` tokens; return the next id (0 from a graph without one)."""
         started_ns = time.monotonic_ns()
         next_id = call(chunk, past, self._kv, interrupt)
         self._took_ns[len(chunk.ids)] = time.monotonic_ns() - started_ns
         return next_id
 
     def expected_ns(self, tokens: int) -> int:
-        """How long the last call of that many tokens took; 0 before there was one."""
+        """Return the duration of the last call with that many tokens, ns; 0 before the first."""
         return self._took_ns.get(tokens, 0)
 
     def last_layer_kv(self, tokens: int) -> Floats:
-        """A copy of K‖V of the first tokens, [1, tokens, kv_dim]."""
+        """Return a copy of K‖V of the first tokens, [1, tokens, kv_dim]."""
         return self._kv[:, :tokens].copy()
 
     def text_of(self, ids: Sequence[int]) -> str:
-        """The text of new tokens, cut at the most that is read."""
+        """Return the text of new tokens, cut at the grammar's longest text."""
         return str(self._tokenizer.decode(list(ids), skip_special_tokens=True))[:MAX_TEXT_CHARS]
 
 
 class GenerationRun:
-    """One generation under way: `feed` parts of the prompt that are known, then `finish` with the rest.
+    """One generation under way: `feed` the available parts of the prompt, then `finish` with the rest.
 
-    The prompt is cut into the same calls however it is fed, so keys, values and text are the same bit for bit. Every
-    method raises CancelledError, ContextOverflowError or GraphError, after which this object is of no further use.
+    The prompt is split into the same calls however it is fed, so keys, values and text are equal bit for bit. Every
+    method raises CancelledError, ContextOverflowError or GraphError; afterwards this object must not be used.
     """
 
     def __init__(
@@ -244,7 +244,7 @@ class GenerationRun:
         self._prefill_ns = 0
 
     def feed(self, segments: Sequence[Segment]) -> None:
-        """Prefill the next part of the prompt; at least one segment has to be left for `finish`."""
+        """Prefill the next part of the prompt; leave at least one segment for `finish`."""
         started_ns = time.monotonic_ns()
         for chunk in self._cut(segments):
             self._run(self._model.prefill_call, chunk)
@@ -258,7 +258,7 @@ class GenerationRun:
         started_ns = time.monotonic_ns()
         *head, last = self._cut(segments)
         if model.prefill_call is not model.decode_call:
-            # A prefill graph of a pair has no vocabulary projection: the last token goes through the decode graph.
+            # The prefill graph of a pair has no vocabulary projection, so the decode graph takes the last token.
             *head, last = set_last_apart([*head, last])
         for chunk in head:
             self._run(model.prefill_call, chunk)

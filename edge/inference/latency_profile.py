@@ -1,8 +1,8 @@
-"""A device's latency profile: how long its generations take, as a file that calibration writes and others draw from.
+"""A device's latency profile: a file of generation times that calibration writes and simulations draw from.
 
-A profile file (JSON or TOML) has `schema = 1`, `name`, `source` (what it was measured on) and `generation_s`, a list of
-times; optionally `anchor_after_s`, of the same length: how long after its start each captured its newest frame; and
-`tagged`: measured or modelled. The flight log and the result of an `edge-run` are read as they are.
+A profile file (JSON or TOML) has `schema = 1`, `name`, `source` (the measured device) and `generation_s`, a list of
+times, s. Optional are `anchor_after_s`, of the same length: time from a generation's start to the capture of its newest
+frame; and `tagged`: measured or modelled. A flight log or the result of an `edge-run` is read directly.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ SCHEMA = 1
 MAX_SAMPLES = 100_000
 MAX_BYTES = 16_000_000
 QUANTILE_STEPS = 200
-"""Into so many times a distribution is cut of which only percentiles are known."""
+"""Number of times drawn from a distribution that is given by percentiles only."""
 _POINTS = ("p50", "p99", "max")
 _KEYS = ("schema", "name", "source", "generation_s", "anchor_after_s", "tagged")
 
 
 class LatencyError(ValueError):
-    """A latency that cannot be used; one line: what, expected, found."""
+    """An unusable latency; the message is one line: what, expected, found."""
 
 
 @dataclass(frozen=True)
@@ -45,12 +45,12 @@ class LatencyProfile:
 
     name: str
     source: str
-    """What it was measured on; "setting" for a constant."""
+    """The measured device; "setting" for a constant."""
     generation_s: tuple[float, ...]
     anchor_after_s: tuple[float, ...] = ()
-    """Empty: every newest frame is the one of its generation's start."""
+    """Time from a generation's start to its newest frame, s; empty: 0 for all."""
     tagged: str = MODELLED
-    """Whether these are times that a device took, or numbers that were set or scaled."""
+    """MEASURED for times of a device, MODELLED for set or scaled numbers."""
 
     def __post_init__(self) -> None:
         times, anchors = self.generation_s, self.anchor_after_s
@@ -67,7 +67,7 @@ class LatencyProfile:
 
     @staticmethod
     def constant(seconds: float) -> LatencyProfile:
-        """Every generation takes this long."""
+        """Return a profile in which every generation takes this long."""
         return LatencyProfile(f"{seconds:g} s", "setting", (float(seconds),))
 
     @property
@@ -76,7 +76,7 @@ class LatencyProfile:
         return sum(self.generation_s) / len(self.generation_s)
 
     def scaled_to_mean(self, mean_s: float) -> LatencyProfile:
-        """Times of the same shape with another mean, as a modelled profile that says so; raises LatencyError."""
+        """Return a modelled profile of the same shape with another mean; raises LatencyError."""
         if not (math.isfinite(mean_s) and mean_s > 0 and self.mean_s > 0):
             raise LatencyError(f"latency: expected means above 0 s, found {self.mean_s:g} s scaled to {mean_s:g} s")
         factor = mean_s / self.mean_s
@@ -91,7 +91,7 @@ class LatencyProfile:
 
     @staticmethod
     def of_json(content: object) -> LatencyProfile:
-        """A profile file's content; raises LatencyError."""
+        """Read a profile file's content; raises LatencyError."""
         if not isinstance(content, Mapping) or content.get("schema") != SCHEMA:
             raise LatencyError(f"expected a table with schema = {SCHEMA}")
         if unknown := sorted(set(content) - set(_KEYS)):
@@ -109,7 +109,7 @@ class LatencyProfile:
 
 
 def load_profile(path: Path) -> LatencyProfile:
-    """A profile (.json, .toml), an edge-run result (.json) or a flight log (.mcap); raises LatencyError."""
+    """Read a profile (.json, .toml), an edge-run result (.json) or a flight log (.mcap); raises LatencyError."""
     try:
         if path.suffix == ".mcap":
             return _of_flight_log(path)
@@ -127,9 +127,9 @@ def load_profile(path: Path) -> LatencyProfile:
 
 
 def times_of(record: Mapping[str, Any]) -> tuple[float, float]:
-    """(time of a generation, how long after its start its newest frame was captured) in s, of a `/semantic` record."""
+    """Return (generation time, time from its start to its newest frame's capture), s, of a `/semantic` record."""
     ready_ns, anchor_ns = int(record["ready_ns"]), int(record["anchor_ns"])
-    # A frame is not younger in virtual time than it was: one captured before the start counts as the start.
+    # A frame captured before the start counts as captured at the start.
     total_s = max(ready_ns - int(record["started_ns"]), ready_ns - anchor_ns) / 1e9
     return total_s, total_s - (ready_ns - anchor_ns) / 1e9
 
@@ -153,7 +153,7 @@ def _of_flight_log(path: Path) -> LatencyProfile:
 
 
 def _of_run(path: Path, reasoning: Mapping[str, Any]) -> LatencyProfile:
-    """From percentiles: below the median nothing is known, so that half takes the median; above they are joined."""
+    """Interpolate percentiles above the median; the half below is unknown and takes the median."""
 
     def points_s(key: str) -> list[float]:
         values = reasoning.get(key)

@@ -45,12 +45,12 @@ class Policy:
             control, lambda: (graph("vision_encoder", cores), graph("action_expert", cores))
         )
         self.guided_by_waypoints = artifacts.guided_by_waypoints
-        """The semantic context is made of the waypoints that were written, anew in every tick, instead of K‖V."""
+        """Whether the semantic context is computed in every tick from the text's waypoints instead of K‖V."""
         role = control if self.guided_by_waypoints else reasoning
         self._context = run_as(role, lambda: graph("semantic_context", role.cores if role else ()))
         self._activity = activity or TickActivity(artifacts.runtime.tick_period_ms * 1_000_000)
         self.tokens_shape = zeros(self._vision.contract.output("visual_tokens")).shape
-        """Of one frame's visual tokens, (1, N, D)."""
+        """Shape of one frame's visual tokens, (1, N, D)."""
         self._encoding, self._acting = self._vision.binding(), self._action.binding()
         self._state, self._latency = (
             cast(FloatArray, zeros(self._action.contract.input(name))) for name in ("state", "latency")
@@ -64,21 +64,21 @@ class Policy:
         self._bound: Context | None = None
 
     def encode(self, frame: npt.NDArray[np.uint8], out: FloatArray | None = None) -> FloatArray:
-        """Frame [1, px, px, 3] → visual tokens [1, N, D] (every new frame, control thread).
+        """Encode a frame [1, px, px, 3] to visual tokens [1, N, D] (every new frame, control thread).
 
-        They are written into `out` if it is given, such as a token ring's next buffer, else into an array of their own.
+        They are written to `out` where given, such as a token ring's next buffer, else to a new array.
         """
         tokens = np.empty(self.tokens_shape, dtype=np.float32) if out is None else out
         if tokens.shape != self.tokens_shape or tokens.dtype != np.float32 or not tokens.flags.c_contiguous:
             raise ValueError(f"out must be a contiguous float32{list(self.tokens_shape)}")
-        # Neither copies anything: they say where the graph reads and writes.
+        # Neither call copies data: both set where the graph reads and writes.
         self._encoding.bind_ortvalue_input("frame", ort.OrtValue.ortvalue_from_numpy(frame))
         self._encoding.bind_ortvalue_output("visual_tokens", ort.OrtValue.ortvalue_from_numpy(tokens))
         self._run(self._vision, self._encoding)
         return tokens
 
     def semantic_context(self, last_layer_kv: FloatArray, interrupt: Interrupt | None = None) -> Context:
-        """K‖V [1, T, kv_dim] → keys and values for every layer (once a generation, reasoning thread).
+        """Project K‖V [1, T, kv_dim] to keys and values for every layer (once a generation, reasoning thread).
 
         Empty for a policy that is guided by waypoints.
         """
@@ -98,7 +98,10 @@ class Policy:
         offset: SE2,
         semantic: SemanticState,
     ) -> FloatArray:
-        """Planned trajectory [steps, 3] in the current robot frame (every tick, control thread); raises GraphError."""
+        """Return the trajectory [steps, 3] in the current robot frame (every tick, control thread).
+
+        Raises GraphError.
+        """
         context = semantic.context
         if self.guided_by_waypoints:
             if semantic.waypoints is None:
@@ -110,7 +113,7 @@ class Policy:
             self._bound = context
         self._state[0] = state
         self._latency[0] = delay_s, offset.x_m, offset.y_m, offset.theta_rad
-        # Bound anew in every call: an accelerator's provider copies an input at the moment it is bound.
+        # Bind again in every call: an accelerator's provider copies an input when it is bound.
         self._acting.bind_ortvalue_input("visual_tokens", ort.OrtValue.ortvalue_from_numpy(visual_tokens))
         for name, value in self._small.items():
             self._acting.bind_ortvalue_input(name, value)

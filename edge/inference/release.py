@@ -1,4 +1,4 @@
-"""Release delays: how long a finished generation is held back, as slower hardware would (paper §3.3, appendix D)."""
+"""Release delays: they hold a finished generation back to emulate slower hardware (paper §3.3, appendix D)."""
 
 from __future__ import annotations
 

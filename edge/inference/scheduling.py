@@ -1,4 +1,4 @@
-"""Which thread runs on which cores and how urgently, what stays in memory, and when reasoning gives way to a tick."""
+"""Sets cores and priority of each thread, locks memory, and makes reasoning wait for ticks."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ Result = TypeVar("Result")
 
 CONTROL_GRAPHS = ("vision_encoder", "action_expert")
 CONTROL_NICENESS = -10
-"""What the control thread asks for where real-time priority is refused."""
+"""Niceness that the control thread requests where real-time priority is refused."""
 REASONING_NICENESS = 10
 SPARE_CORES = 1
-"""Cores left to camera, odometry and recorder before reasoning's threads are fenced in; with fewer, the operating
-system shares the cores out better than a fence would."""
+"""Cores left to camera, odometry and recorder before reasoning's threads are pinned; with fewer, the operating system
+distributes the cores better."""
 ROUND_NS = 1_000_000
 """Period at which a waiting reasoning thread checks again, ns."""
 GAP_NS = 2_000_000
-"""Between a tick's two calls, and after them, the tick is not over yet."""
+"""Time after a call for which its tick still counts as under way: between its two calls, and after them."""
 
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # linux/mman.h
 
 
 @dataclass(frozen=True)
 class Role:
-    """How a thread is to run; the defaults change nothing."""
+    """Scheduling of a thread; the defaults change nothing."""
 
     name: str
     cores: tuple[int, ...] = ()
-    """Cores that it may use; empty: all that the process may."""
+    """Permitted cores; empty: all of the process."""
     priority: int | None = None
-    """Of SCHED_FIFO, 1 to 99; None: ordinary scheduling."""
+    """Priority of SCHED_FIFO, 1 to 99; None: ordinary scheduling."""
     niceness: int = 0
-    """For ordinary scheduling, also where real-time priority is refused."""
+    """Niceness for ordinary scheduling, also where real-time priority is refused."""
 
     def __post_init__(self) -> None:
         if self.priority is not None and not 1 <= self.priority <= 99:
@@ -60,13 +60,13 @@ class Schedule:
     control: Role
     reasoning: Role
     shared: bool
-    """Reasoning can take a core or the accelerator from a tick, so it has to give way by itself."""
+    """Whether reasoning can occupy a tick's core or accelerator, so that it has to wait for ticks."""
     notes: tuple[str, ...] = ()
     """Lines for the operator."""
 
 
 def schedule_for(artifacts: Artifacts, allowed: Collection[int] | None = None) -> Schedule:
-    """The schedule of a target's artifacts on the cores that this process may use."""
+    """Return the schedule of a target's artifacts on this process's cores."""
     runtime = artifacts.runtime
     reasoning_graphs = (*artifacts.language_graphs, "semantic_context")
     sessions = {name: graph.session for name, graph in artifacts.graphs.items()}
@@ -93,9 +93,9 @@ def make_schedule(
     reasoning_threads: int,
     one_device: bool,
 ) -> Schedule:
-    """Roles from what the target asks for and the cores there are; pure.
+    """Return the roles from the target's settings and the available cores; pure.
 
-    Without cores in the target, reasoning leaves the control thread its cores if there are some to spare.
+    Without cores in the target, reasoning avoids the control thread's cores if enough others are available.
     """
     available = set(allowed)
     notes = [
@@ -123,7 +123,7 @@ def _list(cores: Collection[int]) -> str:
 
 
 class ThreadCalls:
-    """What sets the calling thread's scheduling; each raises OSError when it is refused."""
+    """System calls for the calling thread's scheduling; each raises OSError when it is refused."""
 
     def set_cores(self, cores: Collection[int]) -> None:
         os.sched_setaffinity(0, cores)
@@ -137,7 +137,7 @@ class ThreadCalls:
 
 
 def enter(role: Role, calls: ThreadCalls | None = None) -> list[str]:
-    """Give the calling thread its role; whatever is refused is one line for the operator, never an error."""
+    """Apply a role to the calling thread; return one line for the operator per refused setting, never an error."""
     calls = calls or ThreadCalls()
     lines: list[str] = []
     if role.cores:
@@ -162,10 +162,10 @@ def enter(role: Role, calls: ThreadCalls | None = None) -> list[str]:
 
 
 def run_as(role: Role | None, body: Callable[[], Result]) -> Result:
-    """Run `body` in a thread of that role and wait for it: threads that it starts inherit cores and urgency.
+    """Run `body` in a thread of that role and wait for it: its child threads inherit cores and priority.
 
-    ONNX Runtime's workers are such threads: opened from an ordinary thread, those of the language model would be as
-    urgent as the control thread. Raises what `body` raises.
+    ONNX Runtime's workers are such threads: without this, the language model's would have the control thread's
+    priority. Raises what `body` raises.
     """
     if role is None:
         return body()
@@ -180,7 +180,7 @@ def run_as(role: Role | None, body: Callable[[], Result]) -> Result:
 
 
 def _mlockall(flags: int) -> int:
-    """0, or the error number."""
+    """Return 0 or the error number."""
     library = ctypes.CDLL(None, use_errno=True)
     return 0 if library.mlockall(flags) == 0 else ctypes.get_errno()
 
@@ -188,9 +188,9 @@ def _mlockall(flags: int) -> int:
 def lock_memory(
     limit_bytes: int | None = None, mlockall: Callable[[int], int] = _mlockall, euid: int | None = None
 ) -> str | None:
-    """Keep pages in memory once they have been used, so that no tick waits for a disk; a line if it is not permitted.
+    """Lock used pages in memory, so that no tick waits for a disk; return one line where it is not permitted.
 
-    Call it after warm-up. Under a finite limit nothing is locked: later allocations beyond it would fail.
+    Call it after warm-up. Under a finite limit it locks nothing: later allocations beyond the limit would fail.
     """
     if limit_bytes is None:
         limit_bytes = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
@@ -204,13 +204,13 @@ def lock_memory(
 
 
 def freeze_garbage() -> None:
-    """Collect once, then keep the collector away from everything that lives as long as the process."""
+    """Collect garbage once, then exclude all present objects from later collections."""
     gc.collect()
     gc.freeze()
 
 
 class TickActivity:
-    """What the control thread is computing: it writes instants and never waits, any thread may read them."""
+    """Activity of the control thread, which writes instants and never waits; any thread may read them."""
 
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns
@@ -219,23 +219,23 @@ class TickActivity:
         self._busy = False
 
     def begin(self, now_ns: int) -> None:
-        """A call of a tick starts (control thread)."""
+        """Note the start of a tick's call (control thread)."""
         started_ns = self._started_ns
-        # The second call of a tick does not start another one.
+        # The second call of a tick does not start a new tick.
         if started_ns is None or now_ns - started_ns > self._period_ns // 2:
             self._started_ns = now_ns
         self._busy = True
 
     def end(self, now_ns: int) -> None:
-        """That call is over (control thread)."""
+        """Note the end of that call (control thread)."""
         self._ended_ns = now_ns
         self._busy = False
 
     def hold_ns(self, now_ns: int, needs_ns: int) -> int:
-        """How long a call that takes `needs_ns` has to wait before the next check; 0: it may start.
+        """Return the time until the next check for a call that takes `needs_ns`, ns; 0: it may start.
 
-        It waits for the tick under way, and for the next one if it would not be over by then. A call that is longer
-        than the whole gap starts early in one. Ticks that have stopped are not waited for.
+        It waits for the tick under way, and for the next one if the call would overlap with it. A call that is longer
+        than the whole gap starts at the beginning of a gap. It does not wait for ticks that have stopped.
         """
         started_ns, ended_ns = self._started_ns, self._ended_ns
         if started_ns is None or now_ns - started_ns > 2 * self._period_ns:
@@ -254,7 +254,7 @@ class TickActivity:
 
 
 class GiveWay:
-    """Reasoning's side of the rule: called before every call of a graph."""
+    """Makes reasoning wait for ticks; called before every call of a graph."""
 
     def __init__(
         self,
@@ -267,10 +267,10 @@ class GiveWay:
         self._clock = clock
         self._sleep = sleep
         self.waited_ns = 0
-        """Time given away so far."""
+        """Time waited so far."""
 
     def wait(self, needs_ns: int, cancelled: Callable[[], bool]) -> None:
-        """Return when a call of `needs_ns` may start, or has been cancelled."""
+        """Block until a call of `needs_ns` may start or is cancelled."""
         started_ns = self._clock()
         while not cancelled():
             hold_ns = self._activity.hold_ns(self._clock(), needs_ns)

@@ -1,4 +1,4 @@
-"""Warm-up: every graph runs before the robot may move, and a tick that is far too slow is found here."""
+"""Warms up every graph before the robot may move, and refuses ticks that are far too slow."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ WARM_TICKS: Final = 20
 
 
 def warm_up(policy: Policy, language: LanguageModel, image_px: int, frame_count: int) -> float:
-    """Run every graph, so that no tick pays for first-time allocation; the median of warm ticks, ms (graphs only)."""
+    """Run every graph to allocate its memory; return the median duration of warm ticks, ms (graphs only)."""
     here = SE2(0.0, 0.0, 0.0)
     frame = np.zeros((1, image_px, image_px, 3), dtype=np.uint8)
     frames = [EncodedFrame(i, here, policy.encode(frame)) for i in range(frame_count)]
@@ -38,10 +38,10 @@ def warm_up(policy: Policy, language: LanguageModel, image_px: int, frame_count:
 
 
 def check_tick(artifacts: Artifacts, tick_ms: float) -> None:
-    """Refuse graphs that do not run at the speed that they were planned for; raises ArtifactError.
+    """Refuse graphs that are slower than planned; raises ArtifactError.
 
-    Fault matrix row 25: what an accelerator does not take, the processor runs in silence. A target whose plan is not
-    enforced (`runtime.enforce_plan`) promises no speed.
+    Fault matrix row 25: nodes that an accelerator does not support run on the processor without a message. A target
+    whose plan is not enforced (`runtime.enforce_plan`) promises no speed.
     """
     period_ms = artifacts.runtime.tick_period_ms
     if tick_ms <= period_ms:

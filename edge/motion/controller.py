@@ -17,13 +17,13 @@ from firmware_bridge.core.config import LimitsConfig
 
 TARGET_TIME_S = 1.0
 TURN_IN_PLACE_M = 0.05
-"""Targets nearer than this have no direction worth steering to: only the heading is followed."""
+"""Distance below which a target's direction is ignored and only its heading is followed, m."""
 MAX_STEP_S = 0.2
 
 
 @dataclass(frozen=True)
 class ControllerConfig:
-    """Limits of the robot and the ages beyond which inputs are not driven by."""
+    """Limits of the robot and the ages beyond which inputs give zero velocity."""
 
     limits: LimitsConfig
     step_s: float
@@ -37,16 +37,16 @@ class ControllerConfig:
 
 @dataclass(frozen=True)
 class ControllerInputs:
-    """What one tick knows; ages are None while there is no such input at all."""
+    """The inputs of one tick; an age is None while there is no such input."""
 
     trajectory: npt.NDArray[np.float32] | None
     """Planned (x m, y m, θ rad) in the current robot frame, [steps, 3]; None before the first semantic state."""
     frame_age_ms: float | None
     odometry_age_ms: float | None
     speed_scale: float = 1.0
-    """Share of the speed limits that may be used, 0..1 (supervisor); whatever lies outside is taken as 0 or 1."""
+    """Share of the speed limits that may be used (supervisor), clamped to 0..1."""
     hold: str | None = None
-    """Why the velocity must be zero whatever the plan; None: it need not."""
+    """Reason for zero velocity whatever the plan; None: the plan decides."""
 
 
 @dataclass(frozen=True)
@@ -61,26 +61,26 @@ class VelocityCommand:
 
 
 def arc_to(target: SE2, time_s: float) -> tuple[float, float]:
-    """Forward speed (m/s) and yaw rate (rad/s) of the circular arc, tangent to x, that meets the target in `time_s`."""
+    """Return speed (m/s) and yaw rate (rad/s) of the arc, tangent to x, that meets the target in `time_s`."""
     distance_m = math.hypot(target.x_m, target.y_m)
     if distance_m < TURN_IN_PLACE_M:
         return 0.0, target.theta_rad / time_s
     bearing = math.atan2(target.y_m, target.x_m)
     if abs(bearing) > math.pi / 2:
-        # A point behind is turned to, not reversed to: the camera looks forward.
+        # Turn towards a point behind instead of reversing: the camera faces forward.
         return 0.0, math.copysign(math.pi / 2, bearing) / time_s
     arc_m = distance_m if abs(bearing) < 1e-6 else distance_m * bearing / math.sin(bearing)
     return arc_m / time_s, 2 * bearing / time_s
 
 
 def is_plan(trajectory: npt.NDArray[np.float32]) -> bool:
-    """Whether this is something to drive by: rows of three finite numbers, at least one."""
+    """Return whether a trajectory can be driven: at least one row, each of three finite numbers."""
     shaped = trajectory.ndim == 2 and trajectory.shape[0] > 0 and trajectory.shape[1] == 3
     return shaped and bool(np.isfinite(trajectory).all())
 
 
 def target_of(trajectory: npt.NDArray[np.float32], step_s: float) -> SE2:
-    """The point of a finite plan [steps, 3] that is driven to: 1 s ahead, or the last one of a shorter plan."""
+    """Return the target point of a finite plan [steps, 3]: 1 s ahead, or the last one of a shorter plan."""
     index = min(len(trajectory), max(1, round(TARGET_TIME_S / step_s))) - 1
     x_m, y_m, theta_rad = (float(value) for value in trajectory[index])
     return SE2(x_m, y_m, theta_rad)
@@ -89,7 +89,7 @@ def target_of(trajectory: npt.NDArray[np.float32], step_s: float) -> SE2:
 def scale_to_limits(
     speed_mps: float, yaw_rate_radps: float, limits: LimitsConfig, speed_scale: float
 ) -> tuple[float, float]:
-    """Both velocities reduced by one factor until they are within `speed_scale` of the limits: slower on the same arc.
+    """Reduce both velocities by one factor to within `speed_scale` of the limits: slower on the same arc.
 
     `speed_mps` is 0 or more. The result never exceeds a limit, not even by a rounding error.
     """
@@ -103,13 +103,13 @@ def scale_to_limits(
 
 
 def grown(value: float, goal: float, step: float) -> float:
-    """`goal`, with its magnitude at most `step` above that of `value`: speeding up is limited, slowing down is not."""
+    """Return `goal` with its magnitude at most `step` above that of `value`; slowing down is never limited."""
     reached = abs(value) if value * goal > 0 else 0.0
     return math.copysign(min(abs(goal), reached + step), goal)
 
 
 class Controller:
-    """Holds the last command (for the slew limit) and nothing else."""
+    """Controller whose only state is the last command, for the slew limit."""
 
     def __init__(self, config: ControllerConfig) -> None:
         self._config = config
@@ -119,11 +119,11 @@ class Controller:
 
     @property
     def config(self) -> ControllerConfig:
-        """What it was made with; nothing can change it."""
+        """Immutable configuration."""
         return self._config
 
     def step(self, inputs: ControllerInputs, now_ns: int) -> VelocityCommand:
-        """The command of this tick."""
+        """Return the command of this tick."""
         elapsed_s = 0.0 if self._last_ns is None else min(max((now_ns - self._last_ns) / 1e9, 0.0), MAX_STEP_S)
         self._last_ns = now_ns
         reason = self._refusal(inputs)
@@ -138,7 +138,7 @@ class Controller:
         return VelocityCommand(self._vx_mps, 0.0, self._wz_radps, target, "ok")
 
     def halt(self, reason: str) -> VelocityCommand:
-        """Zero velocity; whatever comes next speeds up from there."""
+        """Command zero velocity; the next command accelerates from standstill."""
         self._vx_mps = self._wz_radps = 0.0
         return VelocityCommand(0.0, 0.0, 0.0, None, reason)
 

@@ -1,7 +1,7 @@
-"""Recoveries: commands that replace the plan's where following it leads nowhere (ours).
+"""Recoveries: commands that replace the plan's when it makes no progress (ours).
 
-* Back off: the robot is commanded forward and does not move. It drives back along the poses that it came from, the only
-  free space behind it that is known. The plan cannot do so: it does not feel contact, and its arc never reverses.
+* Back off: the robot is commanded forward and does not move. It drives back along its own trail, the only space behind
+  it that is proved free. The plan cannot do so: it does not sense contact, and its arc never reverses.
 * Turn at a standstill: the plan has stood for long although the text's waypoints lead on. The robot turns on the spot
   towards them, so that the next picture differs.
 * Stand at the goal: once past the goal the robot no longer sees it, and the text becomes unreliable. Texts that see the
@@ -30,31 +30,31 @@ OK: Final = "ok"
 BACKING_OFF: Final = "backing-off"
 TURNING: Final = "turning-to-words"
 ARRIVED: Final = "arrived"
-"""Reasons that commands carry: of the plan's own, and of each recovery."""
+"""Reason of a command: the plan's own, or a recovery's."""
 MOVING: Final = frozenset((BACKING_OFF, TURNING))
-"""Reasons of commands that move the robot in the plan's place."""
+"""Reasons of the recoveries that move the robot."""
 
 MAX_STEP_S: Final = 0.2
-"""Longest time that one late tick counts."""
+"""Largest duration counted for one late tick, s."""
 _TRAIL_M, _TRAIL_RAD = 0.05, 0.1  # spacing of the trail's poses
 _TRAIL_POSES: Final = 60
 _STILL_M, _STILL_RAD = 0.03, 0.1  # less motion than this counts as none
 _LOOK_BACK_M: Final = 0.15  # distance of the trail's pose whose heading is taken up
-_FAILED_M: Final = 0.1  # backing off by less than this has failed
+_FAILED_M: Final = 0.1  # backing off by less than this counts as failed
 _TURN_FIRST_RAD: Final = 0.6  # above this the robot turns before it drives back
 _REACH_S: Final = 0.5  # time in which the heading is corrected, within the limits
 
 PASSED_M: Final = 4.0
 """Largest distance past the stop at which the robot has still arrived, m."""
 SHORT_M: Final = 0.5
-"""The robot has arrived this far before the stop; odometry and text are no more exact."""
+"""Distance before the stop from which the robot has arrived, m; odometry and text are no more exact."""
 ASIDE_M: Final = 1.5
 """Largest lateral distance from the stop at which the robot has arrived, m."""
 
 
 @dataclass(frozen=True)
 class BackOffConfig:
-    """When the robot backs off and how far. With the robot file's `vx_min_mps` of 0 it never reverses."""
+    """When and how far the robot backs off. With the robot file's `vx_min_mps` of 0 it never reverses."""
 
     vx_min_mps: float
     wz_max_radps: float
@@ -68,11 +68,11 @@ class BackOffConfig:
     distance_m: float = 0.3
     at_most_s: float = 3.0
     stands_s: float = 1.0
-    """Without motion for this long the robot gives up backing off."""
+    """Time without motion after which the robot stops backing off, s."""
     further: int = 3
-    """Stuck again at one place it backs off twice as far, then three times, up to this many times."""
+    """Largest multiple of the distance: stuck again at one place, it backs off twice as far, then three times."""
     failures: int = 3
-    """After this many failures at one place it tries no more."""
+    """Number of failures at one place after which the robot no longer backs off there."""
     apart_m: float = 1.0
     """Distance from the first stuck pose at which another place begins."""
 
@@ -84,7 +84,7 @@ class BackOffConfig:
 
 @dataclass
 class _Commanded:
-    """Forward command since the robot was at a pose."""
+    """Accumulated forward command since a pose."""
 
     start: SE2
     for_s: float = 0.0
@@ -93,7 +93,7 @@ class _Commanded:
 
 @dataclass
 class _Retreat:
-    """A drive back under way, `times` as far as the first one at this place."""
+    """A drive back under way, `times` as far as the first one at the same place."""
 
     start: SE2
     since_ns: int
@@ -117,7 +117,7 @@ class BackOff:
     def step(
         self, command: VelocityCommand, T_odom_base: SE2 | None, now_ns: int, speed_scale: float = 1.0
     ) -> VelocityCommand:
-        """Return `command`, or a drive back in its place. A command of zero with a reason comes first and ends it."""
+        """Return `command`, or a drive back in its place. A zero command with a reason takes precedence and ends it."""
         elapsed_s = 0.0 if self._last_ns is None else min(max((now_ns - self._last_ns) / 1e9, 0.0), MAX_STEP_S)
         self._last_ns = now_ns
         scale = min(speed_scale, 1.0) if speed_scale > 0 else 0.0
@@ -164,7 +164,7 @@ class BackOff:
     def _drive_back(
         self, retreat: _Retreat, command: VelocityCommand, pose: SE2, now_ns: int, speed_mps: float, scale: float
     ) -> VelocityCommand | None:
-        """Drive towards the pose before; None where the retreat ends."""
+        """Drive towards the previous pose of the trail; None where the retreat ends."""
         config = self._config
         if command.target is None or hypot(command.target.x_m, command.target.y_m) < _TRAIL_M:
             return None
@@ -197,9 +197,9 @@ class StandstillConfig:
     slower_radps: float = 0.15
     """Planned speeds below these count as standing still."""
     drives_mps: float = 0.2
-    """A planned speed from here on ends the turn."""
+    """Planned speed from which the turn ends, m/s."""
     leads_on_m: float = 1.5
-    """With a nearer last waypoint the text plans to stop."""
+    """Distance of the last waypoint below which the text plans to stop, m."""
     point_m: float = 0.5
     """The robot turns towards the first waypoint at this distance or beyond."""
     aside_rad: float = 0.35
@@ -208,9 +208,9 @@ class StandstillConfig:
     turn_radps: float = 0.5
     held_rad: float = 0.1
     held_s: float = 2.0
-    """Turning by less in this time, the robot is blocked and gives up."""
+    """Rotation below which, in this time, the robot counts as blocked and ends the turn."""
     turns: int = 3
-    """Turns at one place."""
+    """Largest number of turns at one place."""
     apart_m: float = 0.5
     """Distance at which another place begins."""
 
@@ -231,7 +231,7 @@ class _Turn:
 
 
 class StandstillTurn:
-    """Detects that the plan has stood for long, and turns the robot towards the waypoints."""
+    """Detects that the plan has stood still for long, and turns the robot towards the waypoints."""
 
     def __init__(self, config: StandstillConfig) -> None:
         self._config = config
@@ -249,13 +249,13 @@ class StandstillTurn:
         """Return `command`, or the turn in its place.
 
         `waypoints` [points, 2]: m in the robot's frame now; None while the text plans to stand. A command of zero with
-        a reason, a plan that drives, and a text that plans to stand come first and end a turn.
+        a reason, a plan that drives, and a text that plans to stand take precedence and end a turn.
         """
         elapsed_ns = 0 if self._last_ns is None else min(max(now_ns - self._last_ns, 0), round(MAX_STEP_S * 1e9))
         self._last_ns = now_ns
         config, point = self._config, self._point(waypoints)
         if T_odom_base is None or command.reason != OK or command.target is None or not speed_scale > 0 or not point:
-            self._turn = None  # the standing time goes on: sync mode halts while it reasons
+            self._turn = None  # keep counting the standing time: sync mode halts while it reasons
             return command
         speed_mps, yaw_radps = arc_to(command.target, TARGET_TIME_S)
         if self._turn is None:
@@ -315,7 +315,7 @@ class Recovery:
         self._back_off = BackOff(BackOffConfig(limits.vx_min_mps, limits.wz_max_radps))
 
     def hold(self, T_odom_stop: SE2 | None, T_odom_base: SE2) -> str | None:
-        """Return why the robot stands whatever its plan: ARRIVED, or None."""
+        """Return the reason for standing whatever the plan: ARRIVED, or None."""
         return ARRIVED if self._stands_at_goal and has_arrived(T_odom_stop, T_odom_base) else None
 
     def step(
@@ -330,7 +330,7 @@ class Recovery:
 
 
 def _ahead_m(before: SE2, pose: SE2) -> float:
-    """How far a pose lies ahead of another one, along that one's heading, m."""
+    """Return how far a pose is ahead of another one along the other's heading, m."""
     return (before.inverse() @ pose).x_m
 
 
@@ -340,5 +340,5 @@ def distance_m(a: SE2, b: SE2) -> float:
 
 
 def _gap(a: SE2, b: SE2, one_m: float, one_rad: float) -> float:
-    """Distance of two poses in the larger of two units."""
+    """Return the distance of two poses in the larger of two units."""
     return max(distance_m(a, b) / one_m, abs(wrap_angle(b.theta_rad - a.theta_rad)) / one_rad)

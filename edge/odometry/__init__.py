@@ -1,1 +1,1 @@
-"""Where the robot is: body odometry, gyro and camera motion fused into one planar pose with its uncertainty."""
+"""Odometry: body odometry, gyro and camera motion fused into one planar pose with its uncertainty."""

@@ -1,4 +1,4 @@
-"""What `edge-calib odometry` has found out about one robot's odometry, and the runner starts from."""
+"""One robot's odometry calibration: `edge-calib odometry` writes it, the runner starts from it."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ else:
 
 
 class CalibrationError(ValueError):
-    """A calibration file that cannot be used; one line for the operator."""
+    """An unusable calibration file; one line for the operator."""
 
 
 @dataclass(frozen=True)
 class OdometryCalibration:
-    """How a robot's odometry errs, with the standard error of each number; the defaults are those of an unknown robot.
+    """Errors of a robot's odometry, each with its standard error; the defaults are those of an unknown robot.
 
-    Scales are reported / true motion: forward, left and yaw. `sideways_m_per_m` is what it reports to the left for
-    each metre driven forward. The drifts are the RMS error of one metre after these are taken out, per axis.
+    Scales are reported / true motion: forward, left and yaw. `sideways_m_per_m` is the motion reported to the left per
+    metre driven forward. The drifts are the remaining RMS error of one metre, per axis.
     """
 
     scale_x: float = 1.0
@@ -51,7 +51,7 @@ class OdometryCalibration:
 
 
 def load_calibration(path: Path) -> OdometryCalibration:
-    """Read a calibration file; every key is needed and none is unknown. Raises CalibrationError with one clear line."""
+    """Read a calibration file with exactly the fields' keys. Raises CalibrationError with one clear line."""
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:

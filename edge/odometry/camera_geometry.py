@@ -1,7 +1,7 @@
-"""Where the front camera sits and how it projects: pixels ↔ points on a level floor, for a body that rolls and pitches.
+"""Mount and projection of the front camera: pixels ↔ points on a level floor, for a body that rolls and pitches.
 
 The body frame is x forward, y left, z up. Attitude is that of rotation Rz(yaw) Ry(pitch) Rx(roll): positive pitch is
-nose down. The *level base frame* is the body frame turned back to level: floor points are given in it, x and y in m.
+nose down. The *level base frame* is the body frame rotated to level; floor points are in it, x and y in m.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ Array = npt.NDArray[np.float64]
 class CameraGeometry:
     """Pinhole with square pixels, mounted `forward_m` ahead of the base origin.
 
-    `height_m`: camera above the floor while the robot stands level. `pitch_rad`: how far it looks down from the body's
-    x axis. Raises ValueError for what no front camera has.
+    `height_m`: camera above the floor while the robot stands level. `pitch_rad`: pitch downwards from the body's x
+    axis. Raises ValueError for values beyond any front camera.
     """
 
     hfov_rad: float
@@ -42,7 +42,7 @@ class CameraGeometry:
 
 @dataclass(frozen=True)
 class Attitude:
-    """Roll and pitch of the body, rad, and how far its base is above (+) or below its usual height, m."""
+    """Roll and pitch of the body, rad, and height of its base above (+) or below the usual one, m."""
 
     roll_rad: float = 0.0
     pitch_rad: float = 0.0
@@ -63,11 +63,11 @@ class FloorProjector:
         self._geometry = geometry
 
     def camera_height_m(self, attitude: Attitude) -> float:
-        """Height of the camera above the floor: a nose that dips takes it down."""
+        """Height of the camera above the floor, m; a nose-down pitch lowers it."""
         return self._geometry.height_m + attitude.lift_m - self._geometry.forward_m * math.sin(attitude.pitch_rad)
 
     def floor_points(self, pixels: Array, attitude: Attitude) -> tuple[Array, Array]:
-        """Pixels [n, 2] → points on the floor in the level base frame [n, 2], m, and depression below level [n], rad.
+        """Project pixels [n, 2] to floor points in the level base frame [n, 2], m, and depression below level [n], rad.
 
         A pixel at or above the horizon gives a meaningless point: check its depression.
         """
@@ -80,7 +80,7 @@ class FloorProjector:
         return points, depression
 
     def pixels(self, points: Array, attitude: Attitude) -> Array:
-        """Floor points [..., 2] in the level base frame → pixels [..., 2]; behind the camera gives a far-off pixel."""
+        """Project floor points [..., 2] in the level base frame to pixels [..., 2]; points behind give a far pixel."""
         x = points[..., 0] - self._geometry.forward_m * math.cos(attitude.pitch_rad)
         y, z = points[..., 1], -self.camera_height_m(attitude)
         cp, sp = math.cos(attitude.pitch_rad), math.sin(attitude.pitch_rad)
@@ -104,7 +104,7 @@ class FloorProjector:
 
 
 def seen_from(points: Array, motion: Array) -> Array:
-    """Floor points [..., 2] of an earlier level base frame in a later one, which is at `motion` [..., 3] in it."""
+    """Transform floor points [..., 2] from an earlier level base frame to a later one at `motion` [..., 3] in it."""
     c, s = np.cos(motion[..., 2]), np.sin(motion[..., 2])
     x, y = points[..., 0] - motion[..., 0], points[..., 1] - motion[..., 1]
     return np.stack((c * x + s * y, c * y - s * x), axis=-1)

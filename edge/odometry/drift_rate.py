@@ -1,4 +1,4 @@
-"""How much the robot's own odometry drifts: its error over each metre, against a reference that does not use it."""
+"""Estimates the drift of the robot's odometry: its error per metre against an independent reference."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ WINDOW_M = 1.0
 class DriftRate:
     """RMS error of one metre of odometry: m (each of forward and left) and rad, with one standard error each.
 
-    `distance_m` is how much driving it rests on. None: nothing to compare with yet, or no reference for it.
+    `distance_m`: driven distance behind the estimate. None: no comparison yet, or no reference for it.
     """
 
     m_per_m: float | None
@@ -26,7 +26,7 @@ class DriftRate:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Odometry less reference over a short interval: forward, left, yaw; and the variance of the reference's share."""
+    """Odometry less reference over a short interval (forward, left, yaw), and the variance of the reference."""
 
     distance_m: float
     forward_m: float
@@ -62,7 +62,7 @@ class DriftMonitor:
         yaw = sum(c.yaw_rad for c in part)
         square = 0.5 * (forward * forward + left * left) - sum(c.variance_m2 for c in part)
         turn = yaw * yaw - sum(c.variance_rad2 for c in part)
-        # Weighted by the road it adds, so that standing still does not repeat the last metre for ever.
+        # Weighted by the added distance, so that standing still does not repeat the last metre.
         weight = comparison.distance_m
         metre = self._part_m * self._part_m
         entry = (weight, weight * square / metre, weight * turn / metre, self._driven_m)

@@ -1,9 +1,9 @@
-"""Drift estimator: body odometry, gyro, standing still and the camera's motion fused into one pose in the plane.
+"""Drift estimator: fuses body odometry, gyro, standstill and the camera's motion into one planar pose.
 
-Between two visual motions the pose is dead-reckoned from the robot's position increments and the gyro; when a visual
-motion arrives, which is some 0.1 s after the fact, the interval it covers is corrected and what came after is played
-again. A visual motion that contradicts gyro and odometry by more than their errors allow does not enter. The gyro's
-bias is learned whenever the robot stands; scales and bias also from the camera. No clock, thread or I/O in here.
+Between two visual motions it dead-reckons the pose from position increments and the gyro. A visual motion arrives about
+0.1 s late: the estimator corrects the interval that it covers and replays the later increments. It rejects a visual
+motion that contradicts gyro and odometry by more than their errors. It learns the gyro's bias whenever the robot
+stands, and scales and bias also from the camera. Pure: no clock, thread or I/O.
 """
 
 from __future__ import annotations
@@ -37,35 +37,35 @@ from edge.safety.faults.findings import Finding
 from edge.state.pose_history import StampedPose
 
 _SHORT = 1.3
-"""Error rate of a few decimetres over that of a metre, in which part of it has already averaged out."""
+"""Error rate over a few decimetres relative to that over a metre, which partly averages out."""
 
 
 GYRO_NOISE_RADPS_RTHZ = math.radians(0.08)
 """White noise of the yaw rate. A bare BMI088 has 0.014 °/s/√Hz (its data sheet); a trot shakes and tilts it."""
 GYRO_BIAS_WALK_RADPS_RTS = math.radians(0.008)
-"""A trotting body rolls and pitches, which its own vertical axis takes for a turn: 0.02 to 0.07 °/s, simulated."""
+"""Apparent turn of a trotting body, which rolls and pitches: 0.02 to 0.07 °/s, simulated."""
 SCALE_WALK_RTM = 0.005
 """Change of the odometry's scales per square root of a metre."""
 VISUAL_SCALE_SIGMA = 0.007
-"""Error that all visual motions share: of the camera's height and mounting angle."""
+"""Common error of all visual motions, from the camera's height and mounting angle."""
 STAMP_SIGMA_S = 0.01
 """Error of a picture's stamp. A trot sways and yaws fast enough for 10 ms to matter more than the pixels."""
 VISUAL_GATE = 25.0
-"""Squared distance, 3 degrees of freedom, beyond which a visual motion is not believed."""
+"""Squared distance, 3 degrees of freedom, above which a visual motion is rejected."""
 PRIOR_M = 5.0
-"""The calibration's drift counts as much as this much driving."""
+"""Driven distance that weighs as much as the calibration's drift."""
 HISTORY_NS = 30_000_000_000
 NODE_NS = 15_000_000
 PENDING_NS = 2_000_000_000
-"""How long the pose waits for the camera's motion over an interval."""
+"""Longest wait for the camera's motion over an interval."""
 FLOOR_M = 0.001
 FLOOR_RAD = math.radians(0.05)
-"""What no bookkeeping makes more certain: stamps, interpolation, the sway of the body."""
+"""Lower bound of the uncertainty: stamps, interpolation, the sway of the body."""
 
 
 @dataclass(frozen=True)
 class OdometryOutputs:
-    """What one report led to; `pose` is None when it was rejected or brought nothing new."""
+    """Result of one report; `pose` is None when the report was rejected or brought nothing new."""
 
     pose: StampedPose | None
     findings: tuple[Finding, ...]
@@ -74,7 +74,7 @@ class OdometryOutputs:
 
 
 class DriftEstimator:
-    """Fuses what one robot reports. `step` belongs to one thread; the other methods may be called from any."""
+    """Fuses one robot's reports. One thread calls `step`; any thread may call the other methods."""
 
     def __init__(self, calibration: OdometryCalibration | None = None, stamp_sigma_s: float = STAMP_SIGMA_S) -> None:
         self._stamp_sigma_s = stamp_sigma_s
@@ -107,20 +107,20 @@ class DriftEstimator:
 
     @property
     def rejected(self) -> int:
-        """Reports that were not believed."""
+        """Number of rejected reports."""
         return self._gate.rejected
 
     @property
     def gyro_bias_radps(self) -> float:
-        """What the gyro shows at rest, as learned so far; 0 without a gyro."""
+        """Learned gyro bias, rad/s; 0 without a gyro."""
         return self._model.heading if self._model.has_gyro else 0.0
 
     def add_visual(self, motion: VisualMotion) -> None:
-        """Hand over the camera's motion; it is used by the next `step`. Any thread, never waits."""
+        """Queue the camera's motion for the next `step`. Any thread, never waits."""
         self._visual.append(motion)
 
     def motion_offset(self, anchor_ns: int) -> tuple[SE2, Array] | None:
-        """Motion since an instant of the last 30 s, (Δx m, Δy m, Δθ rad), and the covariance [3, 3] of its error.
+        """Return motion since an instant of the last 30 s, (Δx m, Δy m, Δθ rad), and its error covariance [3, 3].
 
         None for an instant before the history begins. Any thread, never waits.
         """
@@ -135,7 +135,7 @@ class DriftEstimator:
         return offset, covariance + np.diag((FLOOR_M**2,) * 2 + (FLOOR_RAD**2,))
 
     def step(self, report: OdometryInputs, now_ns: int) -> OdometryOutputs:
-        """Take one report as it arrives; the pose, what is wrong, and how much the robot's odometry drifts."""
+        """Take one report as it arrives; return the pose, the findings and the odometry's drift."""
         verdict = self._gate.step(report)
         findings = verdict.findings
         if now_ns > report.received_ns:
@@ -181,7 +181,7 @@ class DriftEstimator:
         return StampedPose(node.stamp_ns, node.pose, *velocity, report.roll_rad, report.pitch_rad)
 
     def _learn_bias(self) -> None:
-        """At rest the gyro shows its bias."""
+        """Learn the gyro's bias at rest."""
         measured = self._still.take_rate()
         if measured is None or not self._model.has_gyro:
             return
@@ -205,13 +205,13 @@ class DriftEstimator:
         nodes, node = self._published[0], self._live.node
         if node.stamp_ns - nodes[-1].stamp_ns >= NODE_NS:
             oldest_ns = node.stamp_ns - HISTORY_NS
-            # Two are dropped for one that comes: one more than the time asked for always stays.
+            # Drop up to two per new node, but keep one older than the requested time.
             first = 2 if len(nodes) > 2 and nodes[2].stamp_ns < oldest_ns else 0
             nodes = [*nodes[first:], node]
         self._published = (nodes, node)
 
     def _settle(self, before_ns: int) -> None:
-        """Give up waiting for the camera on what is too long ago."""
+        """Stop waiting for the camera on old intervals."""
         assert self._commit is not None
         while self._pending and self._pending[0].end_ns < before_ns:
             self._commit = advance(self._commit, self._pending.popleft(), self._model)
@@ -230,7 +230,7 @@ class DriftEstimator:
                 self.visual_rejected += 1
 
     def _fuse(self, seen: VisualMotion) -> bool:
-        """Correct the interval that the camera has seen and play again what came after; False if it is not believed."""
+        """Correct the camera's interval and replay later increments; return False for a rejected visual motion."""
         assert self._commit is not None and self._published is not None
         if seen.start_ns < self._commit.node.stamp_ns:
             return False
@@ -254,13 +254,13 @@ class DriftEstimator:
             return False
         gain = self._covariance @ model.T @ np.linalg.inv(total)
         change = gain @ innovation
-        # Given the parameters, odometry and camera are independent: weigh them by their white noise alone. What is left
-        # of the parameters' error then acts through the gains of both, in these shares.
+        # Given the parameters, odometry and camera are independent: weigh them by their white noise alone. The
+        # parameters' remaining error then acts through the gains of both, in these shares.
         share = interval.white @ np.linalg.inv(interval.white + visual)
         motion = interval.motion - interval.gains @ change + share @ (innovation - model @ change)
         white = interval.white - share @ interval.white
         gains = -(interval.gains + share @ model)
-        # Without the stamps' error: what one interval gains by it the next one loses, and here they are added up.
+        # Without the stamps' error: it cancels between consecutive intervals, which are added up here.
         self._compare(interval, observed, float(motion[2]), pictures, white)
         walked = self._covariance - gain @ model @ self._covariance
         self._learn(change, walked + self._walk(interval, seen))
@@ -268,7 +268,7 @@ class DriftEstimator:
         return True
 
     def _mistimed(self, inside: list[Increment]) -> Array:
-        """Covariance of what a robot in motion does between the stamps of two pictures and when they were taken."""
+        """Return the covariance from stamp errors of two pictures while the robot moves."""
         seconds = sum(increment.dt_s for increment in inside)
         if seconds <= 0:
             return np.zeros((3, 3))
@@ -287,7 +287,7 @@ class DriftEstimator:
         return np.diag((heading, scale, scale, 0.0))
 
     def _compare(self, interval: Interval, observed: Array, turn_rad: float, visual: Array, white: Array) -> None:
-        """Odometry against the camera's translation and the fused turn: as reported, and as corrected."""
+        """Compare odometry, reported and corrected, with the camera's translation and the fused turn."""
         # Without a gyro the fused turn contains the odometry's.
         reference = turn_rad if self._model.has_gyro else float(observed[2])
         variance_rad2 = float(white[2, 2] if self._model.has_gyro else visual[2, 2])

@@ -1,8 +1,8 @@
 """Planar motion between two pictures of the floor by least squares: first by corners, then by the pictures themselves.
 
-Six unknowns: x, y, θ of the base, and what attitude and height err by between the two pictures. The latter three carry
-the attitude's own uncertainty as a prior; the trot moves the camera by centimetres and degrees, which would otherwise
-pass for motion. Tukey's weights keep out what is not floor.
+Six unknowns: x, y, θ of the base, and the errors of roll, pitch and height between the two pictures. The latter three
+have the attitude's uncertainty as a prior; the trot moves the camera by centimetres and degrees, which would otherwise
+count as motion. Tukey's weights reject pixels off the floor.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ _STEPS = np.array((1e-4, 1e-4, 1e-4, 1e-3, 1e-4, 1e-4, 1e-4))
 
 
 PIXEL_SIGMA = 0.15
-"""Of a tracked corner, at least."""
+"""Smallest error of a tracked corner, pixels."""
 INLIER_PX = 1.5
 ATTITUDE_SIGMA_RAD = math.radians(0.15)
 HEIGHT_SIGMA = 0.01
 """Relative error of the height between two frames."""
 TILT_SIGMA_RAD = math.radians(0.1)
-"""What one pair of pictures may say about the camera's angle to the floor."""
+"""Prior of the camera's angle to the floor for one pair of pictures."""
 GREY_SIGMA = 1.5
-"""Of a pixel of a smoothed picture, at least."""
+"""Smallest error of a pixel of a smoothed picture, grey levels."""
 SMOOTH_PX = 1.0
 POINTS = 500
 MIN_POINTS = 150
@@ -40,9 +40,9 @@ HALF_WIDTH_M = 1.6
 MIN_SHARE = 0.5
 SETTLE_M = 0.06
 SETTLE_RAD = math.radians(3.0)
-"""How far the pictures may lead from where the corners pointed."""
+"""Largest deviation of the pictures' answer from that of the corners."""
 CORRELATION = 8.5
-"""By how much the covariance of independent pixels is too small: neighbours share blur, texture and sampling."""
+"""Factor on the covariance of independent pixels: neighbours share blur, texture and sampling."""
 _PRIOR: Array = np.array((0.0, 0.0, 0.0, HEIGHT_SIGMA**-2, ATTITUDE_SIGMA_RAD**-2, ATTITUDE_SIGMA_RAD**-2))
 """Information [6] on the six unknowns."""
 
@@ -51,8 +51,8 @@ _PRIOR: Array = np.array((0.0, 0.0, 0.0, HEIGHT_SIGMA**-2, ATTITUDE_SIGMA_RAD**-
 class Solution:
     """The unknowns, the covariance [3, 3] of x, y and θ, how many measurements agreed and their share of all.
 
-    By the pictures there is a seventh unknown, the tilt of the camera in both: `tilt_rad` is what they say of it on
-    their own, `tilt_sigma_rad` its standard error.
+    A fit of the pictures has a seventh unknown, the camera's tilt in both: `tilt_rad` is its estimate without a prior,
+    `tilt_sigma_rad` the standard error.
     """
 
     unknowns: Array
@@ -64,7 +64,7 @@ class Solution:
 
 
 def smooth(grey: npt.NDArray[np.uint8]) -> Picture:
-    """The picture as it is compared: without the finest detail, which no sampling reproduces."""
+    """Smooth a picture for the comparison: remove the finest detail, which sampling does not reproduce."""
     return np.asarray(cv2.GaussianBlur(grey.astype(np.float32), (0, 0), SMOOTH_PX), dtype=np.float32)
 
 
@@ -169,7 +169,7 @@ def align_pictures(
     if inverse is None:
         return None
     covariance = CORRELATION * inverse
-    # Take the prior out again: a sum of many such answers must not count it many times.
+    # Remove the prior: a sum of many such answers must not count it many times.
     information = 1.0 - float(covariance[6, 6]) / TILT_SIGMA_RAD**2
     tilt_rad, tilt_sigma_rad = 0.0, math.inf
     if information > 0.02:
@@ -189,7 +189,7 @@ def _project(projector: FloorProjector, points: Array, attitude: Attitude, q: Ar
 
 
 def _solve(normal: Array, gradient: Array) -> Array | None:
-    """The step that a least-squares problem asks for; None when it is singular or far beyond any frame's motion."""
+    """Solve a least-squares step; None when it is singular or far beyond any frame's motion."""
     try:
         step = np.linalg.solve(normal, -gradient)
     except np.linalg.LinAlgError:
@@ -198,7 +198,7 @@ def _solve(normal: Array, gradient: Array) -> Array | None:
 
 
 def _inverse(normal: Array) -> Array | None:
-    """Covariance of a least-squares problem; None when it leaves a direction open."""
+    """Return the covariance of a least-squares problem; None when a direction is unconstrained."""
     try:
         inverse = np.asarray(np.linalg.inv(normal), np.float64)
     except np.linalg.LinAlgError:
@@ -207,7 +207,7 @@ def _inverse(normal: Array) -> Array | None:
 
 
 def _strong_pixels(key: Picture, floor: npt.NDArray[np.uint8]) -> npt.NDArray[np.int64]:
-    """Pixels [n, 2] (column, row) of the floor with enough slope, evenly thinned to about `points`."""
+    """Return floor pixels [n, 2] (column, row) with enough slope, evenly thinned to about `points`."""
     gx, gy = _slopes(key)
     rows, columns = np.nonzero((np.hypot(gx, gy) > MIN_GRADIENT) & (floor > 0))
     every = max(1, len(rows) // POINTS)
@@ -215,12 +215,12 @@ def _strong_pixels(key: Picture, floor: npt.NDArray[np.uint8]) -> npt.NDArray[np
 
 
 def _slopes(picture: Picture) -> tuple[Picture, Picture]:
-    """Derivatives along the columns and along the rows, grey levels a pixel."""
+    """Return the derivatives along columns and rows, grey levels a pixel."""
     across, down = (cv2.Sobel(picture, cv2.CV_32F, dx, 1 - dx, scale=1 / 8) for dx in (1, 0))
     return np.asarray(across, np.float32), np.asarray(down, np.float32)
 
 
 def _sampled(picture: Picture, at: npt.NDArray[np.float32]) -> Array:
-    """Grey values at pixels [n, 2] between the pixels, [n]."""
+    """Interpolate grey values [n] at fractional pixels [n, 2]."""
     values = cv2.remap(picture, at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR)
     return np.asarray(values[0], dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Which odometry reports may be believed (fault matrix, rows 8 to 12): what is wrong becomes a finding, not motion."""
+"""Checks odometry reports (fault matrix, rows 8 to 12): a wrong one becomes a finding, not motion."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ MAX_AGE_ZERO_NS = 250_000_000
 """Row 11: older than 150 ms limits the speed, older than 250 ms stops."""
 
 MAX_NUMBER = 1e7
-"""A position, angle or speed beyond it is no measurement, and would break arithmetic."""
+"""Largest position, angle or speed of a measurement; larger ones would break arithmetic."""
 
 
 # Bounds of the checks: the fault matrix's, and the Go2's own limits (3.8 m/s, 4 rad/s).
 MAX_SPEED_MPS = 4.0
 MAX_TURN_RADPS = 6.0
 JUMP_M = 0.25
-"""What a report may deviate beyond what top speed explains: jitter of its arrival."""
+"""Tolerance of a report beyond top speed, for the jitter of its arrival."""
 JUMP_RAD = 0.35
 FROZEN_COMMAND_MPS = 0.2
 FROZEN_NS = 500_000_000
@@ -31,24 +31,24 @@ MISMATCH_MPS = 0.5
 MISMATCH_RADPS = 0.5
 MISMATCH_WINDOW_NS = 200_000_000
 CLOCK_DRIFT = 100e-6
-"""How fast the robot's clock may run away from ours; what goes beyond it is a delay, however long it lasts."""
+"""Largest rate difference between the robot's clock and ours; more counts as a delay."""
 CLOCK_BACK_NS = 100_000_000
 CLOCK_STEP_NS = 5_000_000_000
-"""The robot's clock was set when its stamps go back by more than the first, or apart from ours by the second."""
+"""The robot's clock was set when its stamps go back by more than the first, or deviate from ours by the second."""
 
-# Every sign that the protocol carries stays below these for STILL_NS: the robot stands.
+# The robot stands when all reported signals stay below these for STILL_NS.
 STILL_NS = 300_000_000
 STILL_MPS = 0.05
 STILL_RADPS = math.radians(4.0)
 STILL_M = 0.01
 COMMAND_MPS = 0.02
 FOOT_SHARE = 0.2
-"""A foot carries when it feels at least this share of the mean over the feet."""
+"""Share of the mean foot force from which a foot carries load."""
 
 
 @dataclass(frozen=True)
 class OdometryInputs:
-    """One report of the robot, as it came: numbers may be anything. `commanded` is the velocity in force (body frame).
+    """One unchecked report of the robot. `commanded` is the current velocity command (body frame).
 
     `gyro_wz_radps`, `foot_forces`, `commanded` are None where the protocol does not carry them;
     `robot_stamp_ns` is the robot's clock, 0 without one.
@@ -69,7 +69,7 @@ class OdometryInputs:
 
 @dataclass(frozen=True)
 class Increment:
-    """Motion between two accepted reports in the body frame at its middle, by the robot's own account."""
+    """Reported motion between two accepted reports, in the body frame at its middle."""
 
     end_ns: int
     dt_s: float
@@ -77,21 +77,21 @@ class Increment:
     dy_m: float
     odometry_rad: float
     turn_rad: float
-    """By the gyro where there is one, else the same as `odometry_rad`."""
+    """Turn by the gyro; without one the same as `odometry_rad`."""
     still: bool = False
-    """The robot stood: nothing moved, whatever the report's last digits say."""
+    """Whether the robot stood, so that the report's last digits are noise."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What came of one report: an increment unless it was the first or was rejected."""
+    """Result of one report: an increment unless it was the first or was rejected."""
 
     increment: Increment | None
     findings: tuple[Finding, ...]
 
 
 def age_findings(age_ns: int) -> tuple[Finding, ...]:
-    """Row 11 for a pose of this age."""
+    """Return row 11's finding for a pose of this age."""
     if age_ns > MAX_AGE_ZERO_NS:
         return (Finding("odometry-stale", f"{age_ns / 1e6:.0f} ms old, at most 250 ms"),)
     if age_ns > MAX_AGE_LIMIT_NS:
@@ -100,7 +100,7 @@ def age_findings(age_ns: int) -> tuple[Finding, ...]:
 
 
 class OdometryGate:
-    """Checks reports in their order of arrival and turns the good ones into increments."""
+    """Checks reports in their order of arrival and converts the accepted ones to increments."""
 
     def __init__(self) -> None:
         self._last: OdometryInputs | None = None
@@ -130,8 +130,8 @@ class OdometryGate:
         if jumped and self._suspect is not None:
             suspect_dt_s = elapsed_s(self._suspect, report)
             if suspect_dt_s > 0 and not self._jump(self._suspect, report, suspect_dt_s):
-                # It stays where it jumped to: go on from there. The step itself is no motion; the reported velocity
-                # gives what was driven meanwhile.
+                # The pose stays at its new place: continue from there. The jump is no motion; the reported velocity
+                # gives the distance driven meanwhile.
                 return self._accept(self._suspect, report, suspect_dt_s, findings, bridged=last)
         if jumped:
             again = self._suspect is not None
@@ -180,9 +180,9 @@ class OdometryGate:
     def _mismatch(
         self, moved: tuple[float, float, float], dt_s: float, report: OdometryInputs, gyro_radps: float | None
     ) -> tuple[tuple[Finding, ...], bool]:
-        """Row 12: changes of the pose against the reported velocity and the gyro, all over the same short time.
+        """Compare pose changes with reported velocity and gyro over the same short time (row 12).
 
-        Also whether the gyro disagrees: a stuck one shows nothing while the robot turns.
+        Also return whether the gyro disagrees: a stuck one reports no turn while the robot turns.
         """
         dx_m, dy_m, turn_rad = moved
         window_s = MISMATCH_WINDOW_NS / 1e9
@@ -191,7 +191,7 @@ class OdometryGate:
             self._apart.clear()
             self._apart_sums = [0.0] * len(self._apart_sums)
             return (), False
-        # A pose that does not change at all is row 9's.
+        # Row 9 covers a pose that does not change at all.
         has_turn_rates = gyro_radps is not None and any(moved)
         turned_apart = turn_rad - gyro_radps * dt_s if has_turn_rates and gyro_radps is not None else 0.0
         sums = self._apart_sums
@@ -201,7 +201,7 @@ class OdometryGate:
         while len(self._apart) > 1 and sums[0] - self._apart[0][0] >= window_s:
             for index, value in enumerate(self._apart.popleft()):
                 sums[index] -= value
-        # Two reports could be an accident of their arrival; a full window is not.
+        # Two reports may differ by their arrival; a full window does not.
         if sums[0] < 0.7 * window_s or len(self._apart) < 4:
             return (), False
         apart_mps, apart_radps = math.hypot(sums[1], sums[2]) / sums[0], abs(sums[3]) / sums[0]
@@ -215,9 +215,9 @@ class OdometryGate:
         return findings, apart_radps > MISMATCH_RADPS
 
     def _frozen(self, report: OdometryInputs) -> tuple[Finding, ...]:
-        """Row 9, once for every try: the zero that follows ends the try, so that staying frozen shows in a second one.
+        """Return row 9's finding once per attempt to move; the zero that follows ends the attempt.
 
-        Whether a robot at zero would move cannot be seen: the next command tries again, and the table counts.
+        A robot at zero shows no fault: the next command is the next attempt, and the table counts them.
         """
         command = report.commanded
         if command is None or math.hypot(command[0], command[1]) <= FROZEN_COMMAND_MPS:
@@ -238,7 +238,7 @@ class OdometryGate:
         )
 
     def _lag_ns(self, report: OdometryInputs) -> int:
-        """How much later than the quickest report so far this one came, by the robot's own clock."""
+        """Return this report's delay against the quickest report so far, by the robot's own clock."""
         received_ns, stamp_ns = report.received_ns, report.robot_stamp_ns
         if stamp_ns <= 0:
             return 0
@@ -254,11 +254,11 @@ class OdometryGate:
 
 
 def elapsed_s(before: OdometryInputs, after: OdometryInputs) -> float:
-    """Time between two reports: by the robot's clock where it has one, which no network delays, else by arrival."""
+    """Return the time between two reports by the robot's clock, which the network does not delay, else by arrival."""
     received_s = (after.received_ns - before.received_ns) / 1e9
     if before.robot_stamp_ns > 0 and after.robot_stamp_ns > 0:
         robot_s = (after.robot_stamp_ns - before.robot_stamp_ns) / 1e9
-        # A clock that was set measures no duration.
+        # A clock that was set does not measure durations.
         return robot_s if 0 < robot_s < received_s + 1.0 else received_s
     return received_s
 
@@ -271,7 +271,7 @@ def _finite(report: OdometryInputs) -> bool:
 
 
 def _moved(before: OdometryInputs, after: OdometryInputs) -> tuple[float, float, float]:
-    """Forward, left and turn between two reports, in the body frame at the middle of the turn."""
+    """Return forward, left and turn between two reports, in the body frame at the middle of the turn."""
     x0, y0, t0 = before.T_odom_base
     x1, y1, t1 = after.T_odom_base
     turn = wrap_angle(t1 - t0)
@@ -280,7 +280,7 @@ def _moved(before: OdometryInputs, after: OdometryInputs) -> tuple[float, float,
 
 
 class StillCheck:
-    """Every sign that the protocol carries must say so for a while: speed, turn, position, command, and feet."""
+    """Detects standstill: speed, turn, position, command and feet must agree for a while."""
 
     def __init__(self) -> None:
         self._since_ns: int | None = None
@@ -289,7 +289,7 @@ class StillCheck:
         self._seconds = 0.0
 
     def step(self, report: OdometryInputs, increment: Increment, gyro_bias_radps: float) -> bool:
-        """Whether the robot stands, by this report and those before it."""
+        """Return whether the robot stands, by this report and the earlier ones."""
         x, y, _ = report.T_odom_base
         if self._since_ns is not None:
             quiet = self._quiet(report, gyro_bias_radps) and math.dist(self._at, (x, y)) <= STILL_M

@@ -1,9 +1,9 @@
 """Dead reckoning: a chain of poses that gives the uncertainty of the motion between any two of them.
 
-The error of a pose is kept as a left perturbation, true = Exp(ξ) estimate, seen from the chain's origin: there the
-errors of increments simply add up (right-invariant error; Barrau and Bonnabel, "The invariant extended Kalman filter as
-a stable observer", IEEE TAC 2017). So the white part of the error between two poses is the difference of two sums, and
-so is its sensitivity to the parameters that err alike all the time (gyro bias, scales).
+The error of a pose is a left perturbation, true = Exp(ξ) estimate, in the chain's origin, where the errors of
+increments add up (right-invariant error; Barrau and Bonnabel, "The invariant extended Kalman filter as a stable
+observer", IEEE TAC 2017). The white part of the error between two poses is therefore the difference of two sums, and so
+is its sensitivity to the constant parameters (gyro bias, scales).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Node(NamedTuple):
     white: tuple[float, ...]
     sensitivity: tuple[float, ...]
     parameters: Array
-    """Covariance [4, 4] of the parameters' error at this time."""
+    """Covariance [4, 4] of the parameters' error at this instant."""
 
     @property
     def pose(self) -> SE2:
@@ -45,7 +45,7 @@ class Node(NamedTuple):
 
 
 def origin(stamp_ns: int, pose: tuple[float, float, float], parameters: Array) -> Node:
-    """The start of a chain."""
+    """Return the start of a chain."""
     return Node(stamp_ns, *pose, (0.0,) * 6, (0.0,) * (3 * PARAMETERS), parameters)
 
 
@@ -53,7 +53,7 @@ def extend(
     node: Node, end_ns: int, dx_m: float, dy_m: float, turn_rad: float,
     variance_m2: float, variance_rad2: float, heading_gain: float,
 ) -> Node:  # fmt: skip
-    """The pose after a small increment (body frame at its middle); a few µs.
+    """Append a small increment (body frame at its middle); takes a few µs.
 
     `heading_gain`: derivative of the turn by the heading parameter (s for a gyro bias, m for a drift per metre).
     """
@@ -73,7 +73,7 @@ def extend(
 
 
 def add_interval(node: Node, end_ns: int, motion: Array, covariance: Array, gains: Array, parameters: Array) -> Node:
-    """The pose after an interval whose motion (x m, y m, θ rad in the frame of `node`) and error are known.
+    """Append an interval with given motion (x m, y m, θ rad in the frame of `node`) and error.
 
     `covariance` [3, 3] is the white part of that error; `gains` [3, 4] its derivative by the parameters' error.
     """
@@ -86,7 +86,7 @@ def add_interval(node: Node, end_ns: int, motion: Array, covariance: Array, gain
 
 
 def between(before: Node, after: Node, stamp_ns: int) -> Node:
-    """The chain at an instant between two nodes, in a straight line."""
+    """Interpolate the chain linearly at an instant between two nodes."""
     span_ns = after.stamp_ns - before.stamp_ns
     f = 0.0 if span_ns <= 0 else min(max((stamp_ns - before.stamp_ns) / span_ns, 0.0), 1.0)
     pose = interpolate(before.pose, after.pose, f)
@@ -96,7 +96,7 @@ def between(before: Node, after: Node, stamp_ns: int) -> Node:
 
 
 def at(nodes: Sequence[Node], stamp_ns: int) -> Node | None:
-    """The chain at an instant: interpolated; its end after the end; None before its beginning or while it is empty."""
+    """Return the chain at an instant, interpolated; after the end its end; None before its start or while empty."""
     if not nodes or stamp_ns < nodes[0].stamp_ns:
         return None
     index = bisect_right(nodes, stamp_ns, key=lambda node: node.stamp_ns)
@@ -104,7 +104,7 @@ def at(nodes: Sequence[Node], stamp_ns: int) -> Node | None:
 
 
 def relative(anchor: Node, now: Node) -> tuple[SE2, Array]:
-    """Pose of `now` in the frame of `anchor`, and the covariance [3, 3] of its error over (x m, y m, θ rad).
+    """Return the pose of `now` in the frame of `anchor`, and its error covariance [3, 3] over (x m, y m, θ rad).
 
     The parameters' covariance is the mean of that at both ends: exact while they do not change in between.
     """
@@ -135,10 +135,10 @@ def _upper(matrix: Array) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class OdometryModel:
-    """How reports become motion: parameters as known now, and the size of what they do not explain.
+    """Model from reports to motion: current parameters, and the size of the unexplained error.
 
     `heading`: the gyro's bias, rad/s, or without a gyro the odometry's yaw drift, rad/m. `scale`: reported over
-    true forward motion less one. `sideways`: what is reported to the left per metre driven forward.
+    true forward motion less one. `sideways`: motion reported to the left per metre driven forward.
     """
 
     has_gyro: bool
@@ -152,7 +152,7 @@ class OdometryModel:
     rate_rad_per_m: float
 
     def corrected(self, increment: Increment) -> tuple[float, float, float, float]:
-        """Forward m, left m and turn rad as they were by these parameters; and the turn's derivative by `heading`."""
+        """Return corrected forward m, left m and turn rad, and the turn's derivative by `heading`."""
         if increment.still:
             return 0.0, 0.0, 0.0, 0.0
         forward = increment.dx_m / (1.0 + self.scale)
@@ -164,7 +164,7 @@ class OdometryModel:
 
 
 class Cursor(NamedTuple):
-    """A place in the chain, and how far the robot has driven since the camera last had a say."""
+    """A node of the chain, and the distance driven since the last visual correction."""
 
     node: Node
     unseen_m: float
@@ -173,8 +173,8 @@ class Cursor(NamedTuple):
 class Interval(NamedTuple):
     """Motion over some increments in the frame at their beginning, [3] (x m, y m, θ rad).
 
-    `uncorrected` [2], m: as the robot reported it. `gains` [3, 4]: how the parameters enter the reports.
-    `white` [3, 3]: covariance of what they do not explain.
+    `uncorrected` [2], m: as the robot reported it. `gains` [3, 4]: derivative by the parameters.
+    `white` [3, 3]: covariance of the unexplained error.
     """
 
     motion: Array
@@ -187,12 +187,12 @@ class Interval(NamedTuple):
 
 
 def grown(distance_m: float) -> float:
-    """Variance of the odometry's error over a distance, for a rate of one: it errs alike over a metre, then afresh."""
+    """Return the odometry's error variance over a distance at rate 1: constant error per metre, independent metres."""
     return distance_m * distance_m if distance_m < 1.0 else 2.0 * distance_m - 1.0
 
 
 def advance(cursor: Cursor, increment: Increment, model: OdometryModel) -> Cursor:
-    """Dead-reckon one increment: the error grows with the gyro's time and the odometry's road."""
+    """Dead-reckon one increment: the error grows with the gyro's time and the odometry's distance."""
     forward, left, turn, gain = model.corrected(increment)
     unseen_m = cursor.unseen_m + math.hypot(forward, left)
     share = grown(unseen_m) - grown(cursor.unseen_m)
@@ -209,7 +209,7 @@ def advance(cursor: Cursor, increment: Increment, model: OdometryModel) -> Curso
 
 
 def integrate(increments: list[Increment], model: OdometryModel) -> Interval:
-    """Add up increments, with the derivatives by the parameters."""
+    """Sum increments and their derivatives by the parameters."""
     x = y = theta = turned = distance = plain_x = plain_y = odometry = seconds = 0.0
     gains = np.zeros((3, PARAMETERS))
     still = True
@@ -249,7 +249,7 @@ def integrate(increments: list[Increment], model: OdometryModel) -> Interval:
 def split(
     pending: Iterable[Increment], begin_ns: int, start_ns: int, end_ns: int
 ) -> tuple[list[Increment], list[Increment], list[Increment]]:
-    """Increments that follow each other from `begin_ns` on: before, between and after two instants, cut at them."""
+    """Split consecutive increments from `begin_ns` on at two instants: before, between and after."""
     parts: tuple[list[Increment], list[Increment], list[Increment]] = ([], [], [])
     for increment in pending:
         for index, edge_ns in enumerate((start_ns, end_ns)):
@@ -274,7 +274,7 @@ def _cut(increment: Increment, share: float, at_ns: int) -> tuple[Increment, Inc
 
 
 def bent(nodes: list[Node], start: Node, end: Node) -> list[Node]:
-    """Dead-reckoned nodes after `start`, moved so that they lead to `end`, each by its share of the time."""
+    """Shift the dead-reckoned nodes after `start` so that they end at `end`, each by its share of the time."""
     back = start.pose.inverse()
     reached, wanted = back @ nodes[-1].pose, back @ end.pose
     dx, dy = wanted.x_m - reached.x_m, wanted.y_m - reached.y_m

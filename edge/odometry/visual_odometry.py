@@ -1,8 +1,8 @@
-"""Planar motion from the front camera: corners of the floor are tracked and seen as points of a plane of known height.
+"""Planar motion from the front camera: tracks corners of the floor as points of a plane at the camera's height.
 
-Scale comes from the camera's height, level from the robot's attitude, so the result owes nothing to its odometry. What
-is not floor (walls, people, furniture) moves otherwise and is outvoted; where there is nothing to hold on to, the dark,
-blur or a crowd, there is no answer instead of a bad one. A few milliseconds a frame: run it in the camera thread.
+Scale comes from the camera's height and level from the robot's attitude, so the result does not depend on odometry.
+Objects off the floor (walls, people, furniture) move differently and are outvoted. In the dark, in blur or in a crowd
+there is no answer instead of a bad one. It takes a few milliseconds a frame: run it in the camera thread.
 """
 
 from __future__ import annotations
@@ -37,24 +37,24 @@ Covariance = tuple[float, float, float, float, float, float, float, float, float
 MAX_CORNERS = 80
 MIN_CORNERS = 12
 RENEW_CORNERS = 18
-"""With fewer left, an answer is given while it can be."""
+"""Number of corners below which an answer is given early, while it is possible."""
 MIN_DEPRESSION_RAD = math.radians(7.0)
-"""Floor nearer to the horizon than this moves too little to measure."""
+"""Smallest angle below the horizon of measurable floor: farther floor moves too little."""
 KEYFRAME_DISTANCE_M = 0.25
 KEYFRAME_TURN_RAD = math.radians(8.0)
 KEYFRAME_AGE_NS = 1_000_000_000
 MAX_GAP_NS = 500_000_000
-"""Corners are not followed across a longer pause between frames."""
+"""Longest pause between frames across which corners are tracked."""
 MIN_INLIER_SHARE = 0.4
 MIN_BRIGHTNESS = 12.0
 """Mean grey value, 0..255."""
 HYPOTHESES = 64
 TILT_SIGMA_RAD = math.radians(0.2)
-"""Error of the camera's angle to the floor: mounting, lens centre and the robot's own attitude together."""
+"""Error of the camera's angle to the floor: mounting, lens centre and the robot's attitude together."""
 TILT_CAUTION = 2.0
-"""One answer about it errs by this much more than its pixels say: their errors are alike from frame to frame."""
+"""Factor on the error of one estimate of it: pixel errors correlate from frame to frame."""
 TILT_FLOOR_RAD = math.radians(0.03)
-"""It is never known better than this, and so goes on being learned."""
+"""Smallest uncertainty of it, which keeps it learning."""
 MAX_TILT_RAD = math.radians(1.0)
 
 
@@ -67,7 +67,7 @@ class VisualMotion:
     T_start_end: SE2
     covariance: Covariance
     corners: int
-    """How many corners agreed."""
+    """Number of agreeing corners."""
 
 
 @dataclass(frozen=True)
@@ -80,9 +80,9 @@ class _Keyframe:
 
 
 def grey_frame(jpeg: bytes, width_px: int = 320) -> Grey | None:
-    """JPEG → grey picture [h, w] of about `width_px`; None when it is not a picture of a sensible size.
+    """Decode a JPEG to a grey picture [h, w] of about `width_px`; None for an invalid picture or size.
 
-    The decoder itself shrinks by 2, 4 or 8, which is cheaper than decoding the whole.
+    The decoder shrinks by 2, 4 or 8, which is cheaper than decoding at full size.
     """
     size = jpeg_size(jpeg)
     if size is None or jpeg_refusal(jpeg) is not None:
@@ -103,7 +103,7 @@ def _reduced(ratio: float) -> int:
 
 
 class VisualOdometry:
-    """Follows the floor from a key frame to the newest frame; answers once the robot has moved enough to measure."""
+    """Tracks the floor from a key frame to the newest frame; answers once the robot has moved enough."""
 
     def __init__(self, geometry: CameraGeometry) -> None:
         self._geometry = geometry
@@ -115,13 +115,13 @@ class VisualOdometry:
         self._tracked: Array = np.zeros((0, 2))
         self._rng = np.random.default_rng(0)
         self.tilt_rad = 0.0
-        """Learned error of the camera's pitch, rad: how much further down it points than its geometry states."""
+        """Learned error of the camera's pitch, rad: true less stated downward pitch."""
         self._tilt_variance = TILT_SIGMA_RAD**2
         self.refused = 0
-        """Frames on which the floor could not be followed any more."""
+        """Number of frames at which tracking was lost."""
 
     def step(self, grey: Grey, stamp_ns: int, attitude: Attitude) -> VisualMotion | None:
-        """Take a frame [h, w]; the motion since the last key frame when it is due, else None.
+        """Take a frame [h, w]; return the motion since the last key frame when it is due, else None.
 
         Frames must come in the order of their stamps; one that does not advance is ignored. Raises ValueError for a
         picture that is not uint8 [h, w].
@@ -164,7 +164,7 @@ class VisualOdometry:
     def _answer(
         self, projector: FloorProjector, key: _Keyframe, grey: Grey, stamp_ns: int, attitude: Attitude, solved: Solution
     ) -> VisualMotion:
-        """The motion by the whole picture; by its corners where that does not settle near them."""
+        """Estimate the motion by the whole picture; by its corners where that fit does not converge near them."""
         aligned = align_pictures(
             projector, key.picture, key.attitude, smooth(grey), attitude, solved.unknowns, key.floor
         )
@@ -179,7 +179,7 @@ class VisualOdometry:
         return VisualMotion(key.stamp_ns, stamp_ns, SE2(x, y, theta), covariance, solved.inliers)
 
     def _learn_tilt(self, aligned: Solution) -> None:
-        """Learn the camera's pitch from what near and far floor agree on best: mounting, attitude and lens."""
+        """Learn the camera's pitch from the best agreement of near and far floor: mounting, attitude and lens."""
         gain = self._tilt_variance / (self._tilt_variance + (TILT_CAUTION * aligned.tilt_sigma_rad) ** 2)
         learned = self.tilt_rad + gain * aligned.tilt_rad
         self.tilt_rad = min(max(learned, -MAX_TILT_RAD), MAX_TILT_RAD)
@@ -200,7 +200,7 @@ class VisualOdometry:
         )
 
     def _floor_mask(self, projector: FloorProjector, attitude: Attitude) -> Grey:
-        """255 where a pixel would show floor that is near enough; columns are sampled, the edge between is straight."""
+        """Return a mask, 255 where a pixel would show near floor; sampled columns, straight edge between them."""
         height, width = self._shape
         mask = np.zeros((height, width), np.uint8)
         columns = np.linspace(0, width - 1, 9)
@@ -213,13 +213,13 @@ class VisualOdometry:
             first[index] = below[0] if len(below) else height
         edge = np.interp(np.arange(width), columns, first)
         mask[rows[:, None] >= edge[None, :]] = 255
-        # A corner at the rim is about to leave the picture, and its neighbourhood is cut off.
+        # A corner at the border is about to leave the picture, and its neighbourhood is incomplete.
         mask[:, :4] = mask[:, -4:] = 0
         mask[-4:, :] = 0
         return mask
 
     def _follow(self, grey: Grey) -> bool:
-        """Track the corners from the previous frame into this one and back; False when too few come back."""
+        """Track the corners from the previous frame into this one and back; return False when too few agree."""
         assert self._previous is not None and self._key is not None
         before = self._tracked.astype(np.float32)[:, None, :]
         after, ok = _track(self._previous, grey, before)
@@ -236,7 +236,7 @@ class VisualOdometry:
         return True
 
     def _solve(self, projector: FloorProjector, key: _Keyframe, attitude: Attitude) -> Solution | None:
-        """The motion since the key frame by its corners."""
+        """Estimate the motion since the key frame by its corners."""
         before, _ = projector.floor_points(key.corners, key.attitude)
         after, depression = projector.floor_points(self._tracked, attitude)
         usable = depression > MIN_DEPRESSION_RAD / 2
@@ -253,7 +253,7 @@ class VisualOdometry:
     def _vote(
         self, projector: FloorProjector, before: Array, after: Array, usable: npt.NDArray[np.bool_], attitude: Attitude
     ) -> Array | None:
-        """The planar motion (x, y, θ) that most corners agree with, out of those that two corners each define."""
+        """Return the planar motion (x, y, θ) of most agreeing corners, among those that pairs of corners define."""
         indices = np.flatnonzero(usable)
         pairs = self._rng.choice(indices, (HYPOTHESES, 2))
         p, q = before[pairs], after[pairs]
@@ -281,6 +281,6 @@ class VisualOdometry:
 def _track(
     before: Grey, after: Grey, corners: npt.NDArray[np.float32]
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint8]]:
-    """Corners [n, 1, 2] of one picture in the next, and which of them were found."""
+    """Track corners [n, 1, 2] of one picture into the next; also return which were found."""
     at, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, corners.copy(), winSize=(13, 13), maxLevel=3)
     return np.asarray(at, np.float32), np.asarray(found, np.uint8)

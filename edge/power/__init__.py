@@ -1,1 +1,1 @@
-"""Electric power: what the device draws, what it may draw, and how reasoning is shed to stay below it."""
+"""Electric power: the device's draw, its budget, and the shedding of reasoning to stay below it."""

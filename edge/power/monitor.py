@@ -1,7 +1,7 @@
 """The power thread: reads meter, heat and battery about ten times a second, steps the governor, publishes its budget.
 
-Each source is read by a thread of its own, so that one that blocks costs its own value and nothing else: the stepping
-thread takes the newest value of each, and one that is too old counts as missing. Nobody waits for any of these threads.
+Each source has its own reader thread, so that a blocked source costs only its own value. The stepping thread takes the
+newest value of each; a value that is too old counts as missing. No other thread waits for these threads.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Activity:
-    """What the program has done so far; counts only grow."""
+    """The program's activity so far; counts only grow."""
 
     ticks: int = 0
     reasoning: bool = False
@@ -38,14 +38,14 @@ class Activity:
     generations: int = 0
     """Finished ones."""
     reasoning_s: float = 0.0
-    """Time that generations have taken."""
+    """Total time of generations, s."""
     abandoned: int = 0
-    """Generations that were begun and not finished, whatever the reason."""
+    """Number of generations that were begun and not finished, whatever the reason."""
 
 
 @dataclass(frozen=True)
 class PowerSnapshot:
-    """Everything that is known of power at one step."""
+    """All power readings and results of one step."""
 
     stamp_ns: int
     sample: PowerSample | None
@@ -57,7 +57,7 @@ class PowerSnapshot:
     over_current: dict[str, int]
 
     def record(self) -> dict[str, Any]:
-        """The `/power` record of the flight log."""
+        """Return the `/power` record of the flight log."""
         outputs, sample = self.outputs, self.sample
         return {
             "stamp_ns": self.stamp_ns,
@@ -75,7 +75,7 @@ class PowerSnapshot:
 
 
 class _Source(Generic[T]):
-    """Calls a function at a rate in a thread of its own and keeps its newest value and when it came."""
+    """Calls a function at a rate in a separate thread and keeps its newest value with its instant."""
 
     def __init__(self, name: str, read: Callable[[int], T], period_s: float, clock: Callable[[], int]) -> None:
         self._read = read
@@ -87,19 +87,19 @@ class _Source(Generic[T]):
         self.error: str | None = None
 
     def fresh(self, now_ns: int, oldest_ns: int) -> T | None:
-        """The newest value if it is not too old."""
+        """Return the newest value if it is not too old, else None."""
         newest = self._newest
         return None if newest is None or now_ns - newest[0] > oldest_ns else newest[1]
 
     def read(self) -> None:
-        """Read once in the calling thread; a failure leaves the newest value as it was."""
+        """Read once in the calling thread; a failure keeps the previous value."""
         began_ns = self._clock()
         try:
             self._newest = (began_ns, self._read(began_ns))
             self.error = None
         except MeterError as error:
             self.error = str(error)
-        except Exception as error:  # noqa: BLE001 - a driver's surprise may cost its value, not the thread
+        except Exception as error:  # noqa: BLE001 - an unexpected driver error may cost its value, not the thread
             self.error = f"{type(error).__name__}: {error}"
 
     def _run(self) -> None:
@@ -126,8 +126,8 @@ class PowerMonitor:
         period_s: float = PERIOD_S,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`activity` and `battery` must not block. `on_sample` gets (stamp_ns, `/power` record) every step,
-        `on_findings` what was found in every step in which there is something, `say` a line when something changes."""
+        """`activity` and `battery` must not block. `on_sample` takes (stamp_ns, `/power` record) in every step,
+        `on_findings` the findings of every step with any, `say` a line on every change."""
         self._meter = meter
         self._governor = governor
         self._activity = activity
@@ -150,13 +150,13 @@ class PowerMonitor:
         self._snapshot = PowerSnapshot(clock(), None, GovernorOutputs(), None, None, None, {})
 
     def start(self) -> None:
-        """Begin; until the first step nothing is limited."""
+        """Start the threads; before the first step nothing is limited."""
         for source in self._sources():
             source.thread.start()
         self._thread.start()
 
     def close(self) -> None:
-        """End; a reading that hangs is waited for at most half a second in all, and ends with the process."""
+        """Stop the threads; wait at most 0.5 s in all for hanging readings, which end with the process."""
         self._stop.set()
         for source in self._sources():
             source.stop.set()
@@ -166,15 +166,15 @@ class PowerMonitor:
                 thread.join(max(0.0, deadline_s - time.monotonic()))
 
     def budget(self) -> ReasoningBudget:
-        """What reasoning may do now."""
+        """The current budget of reasoning."""
         return self._snapshot.outputs.budget
 
     def snapshot(self) -> PowerSnapshot:
-        """The last step's view."""
+        """The readings and results of the last step."""
         return self._snapshot
 
     def statistics(self) -> dict[str, Any]:
-        """`power_w` of a result: mean and p99 of the metered samples, in W, and where they come from."""
+        """Return `power_w` of a result: mean and p99 of the metered samples, W, and their source."""
         mean_w, p99_w = self._statistics.mean_w, self._statistics.percentile_w(0.99)
         result: dict[str, Any] = {
             "mean": None if mean_w is None else round(mean_w, 3),
@@ -187,12 +187,12 @@ class PowerMonitor:
         return result
 
     def read(self) -> None:
-        """Read every source once in the calling thread: for a caller of `step` that does not `start` the threads."""
+        """Read every source once in the calling thread, for a caller of `step` without threads."""
         for source in self._sources():
             source.read()
 
     def step(self, now_ns: int) -> PowerSnapshot:
-        """One step of the stepping thread, without its clock."""
+        """Run one step of the stepping thread, without its clock."""
         sample = None if self._power is None else self._power.fresh(now_ns, STALE_NS)
         thermal = None if self._heat is None else self._heat.fresh(now_ns, THERMAL_STALE_NS)
         heat = self._judge_heat(thermal)
@@ -223,7 +223,7 @@ class PowerMonitor:
         return self._snapshot
 
     def _judge_heat(self, thermal: ThermalState | None) -> ThermalState | None:
-        """The newest known distances: while a source gives no value or leaves a distance out, its last one counts."""
+        """Return the newest distances; a missing one keeps its last value."""
         last, lost = self._judged_heat, self._judged_heat is not None and thermal is None
         if lost != self._heat_lost and self._say is not None:
             self._say(f"power: temperatures {'are not read: what heat limits stays as it is' if lost else 'are read'}")
@@ -250,7 +250,7 @@ class PowerMonitor:
                 snapshot = self.step(self._clock())
                 self._publish(snapshot)
                 self._failed = None
-            except Exception as error:  # noqa: BLE001 - whatever fails here must not end the governing
+            except Exception as error:  # noqa: BLE001 - no error here may end the governing
                 self._fail(f"{type(error).__name__}: {error}")
             self._stop.wait(self._period_s)
 

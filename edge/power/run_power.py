@@ -1,4 +1,4 @@
-"""The power side of a run: the target's meter, its governor, and what both know of the program's activity."""
+"""Builds the power monitor of a run: the target's meter, its governor, and the program's activity."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def make_power_monitor(
     say: Callable[[str], object],
     sysfs_root: Path = SYSFS,
 ) -> PowerMonitor:
-    """The monitor of a target's power plan; raises ArtifactError.
+    """Return the monitor of a target's power plan; raises ArtifactError.
 
-    Without the meter that the target names, its model stands in and `say` gets a line.
+    Without the target's meter the plan's model replaces it and `say` takes a line.
     """
     plan = read_power_plan(artifacts)
     return PowerMonitor(
@@ -54,13 +54,13 @@ def _meter(
     try:
         return open_meter(plan.meter, sysfs_root=sysfs_root, rail=plan.rail, idle_w=idle_w, energy_j=energy_j)
     except MeterError as error:
-        instead = "nothing stands in for it" if idle_w is None else "the plan's model stands in for it"
+        instead = "nothing replaces it" if idle_w is None else "the plan's model replaces it"
         say(f"power: {error}; {instead}")
         return None if idle_w is None else open_meter("modelled", idle_w=idle_w, energy_j=energy_j)
 
 
 def _energy_j(plan: PowerPlan, activity: Activity) -> float:
-    """Modelled energy above idle of all that has run; a generation's is spread over the time that it takes."""
+    """Return the modelled energy above idle so far, J; a generation's is spread over its duration."""
     model = plan.model
     if model is None:
         return 0.0

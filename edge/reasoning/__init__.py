@@ -1,1 +1,1 @@
-"""The model's prompt, the rules of its reasoning text, and what an instruction keeps between generations."""
+"""The model's prompt, the rules of its reasoning text, and the memory of an instruction between generations."""

@@ -1,4 +1,4 @@
-"""Late anchor: when the newest frame of a generation is to be captured, so that the older ones can be prefilled first.
+"""Late anchor: plans the capture of a generation's newest frame, so that the older ones can be prefilled first.
 
 A generation's frames are 3 s apart. If all are taken at its start, the newest one ages while the older ones are
 prefilled. The newest frame is therefore planned for the end of that prefill.
@@ -31,9 +31,9 @@ class Anchor:
 
     @classmethod
     def after(cls, newest_ns: int, prefix_ns: int) -> Anchor:
-        """Planned for when the prefix, expected to take `prefix_ns`, is done.
+        """Plan the capture for the end of the prefix, which takes about `prefix_ns`.
 
-        The frame that is newest then will be as old as the newest is now, so camera and encoder cancel out.
+        The newest frame then will be as old as the newest is now, so the delays of camera and encoder cancel out.
         """
         return cls(newest_ns, newest_ns + max(0, prefix_ns))
 
@@ -43,17 +43,17 @@ class Anchor:
         return cls(newest_ns, newest_ns, 0)
 
     def older_ns(self, offset_s: float) -> int:
-        """Wanted stamp of an older frame of that age, ns."""
+        """Return the planned stamp of an older frame of that age, ns."""
         return self.planned_ns - round(offset_s * 1e9)
 
     def is_older(self, stamp_ns: int) -> bool:
-        """Whether a frame precedes every candidate for the newest frame."""
+        """Return whether a frame precedes every candidate for the newest frame."""
         return stamp_ns < max(self.begun_ns, self.planned_ns - EARLY_NS)
 
     def choose(self, newest_ns: int) -> int | None:
-        """Stamp to take the frame at, of those up to the newest; None: wait for the next one.
+        """Return the stamp of the frame to use, at most the newest; None: wait for the next one.
 
-        If the prefix took much longer than planned, the spacing is kept rather than the newest frame taken.
+        If the prefix took much longer than planned, keep the spacing instead of the newest frame.
         """
         if newest_ns < self.planned_ns - EARLY_NS:
             return None
@@ -61,9 +61,9 @@ class Anchor:
 
 
 def older_frames(ring: TokenRing, plan: Anchor, offsets_s: Sequence[float]) -> Iterator[EncodedFrame]:
-    """Frames before the newest at the given ages, oldest first; `offsets_s`: ages, s, in descending order.
+    """Yield the frames before the newest, oldest first; `offsets_s`: ages, s, in descending order.
 
-    Each frame is looked up only when it is asked for: with a slow model it may not have been captured earlier.
+    Each frame is fetched only on iteration: with a slow model it may not have been captured earlier.
     """
     last_ns: int | None = None
     for offset_s in offsets_s:

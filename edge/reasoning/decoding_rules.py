@@ -43,11 +43,11 @@ Encode: TypeAlias = Callable[[str], Sequence[int]]
 
 
 FREE: Final = "free"
-"""Any progress: no progress is known yet, or the rules are off."""
+"""Any progress: there is no earlier one, or the rules are off."""
 ONWARD: Final = "onward"
 """The same progress, an opening more or less, or the next turn."""
 EITHER_WAY: Final = "either way"
-"""The turn before as well: the model was refused once, and may be right."""
+"""The previous turn as well: the model was refused once and may be right."""
 FOLLOWS: Final = (FREE, ONWARD, EITHER_WAY)
 BACK, DONE = "back", "done"
 """Kinds of refused progress: a turn undone; a turn done that the robot cannot have made."""
@@ -61,16 +61,16 @@ OVERDUE_M: Final = 1.0
 NOW_M: Final = 1.0
 """Turns nearer than this are written as "now", as in training."""
 TURNED_RAD: Final = 0.44
-"""A robot that has rotated this far to a side, 25°, and still heads there may have made the turn; turns are of 90°."""
+"""Rotation to a side, 25°, from which a robot that still heads there may have made the turn; turns are of 90°."""
 ONCE_TURNED_RAD: Final = 0.79
-"""A robot that has once rotated this far to a side, 45°, has made the turn, whatever its heading is now."""
+"""Rotation to a side, 45°, from which the robot has made the turn, whatever its present heading."""
 EARLIER_NS: Final = 3_000_000_000
-"""A turn may begin this long before the text names it as the next one."""
+"""Longest time by which a turn may begin before the text names it as the next one."""
 SETTLED_RAD: Final = 0.09
 """Yaw change below which a turn counts as finished, rad (5° in 1 s)."""
 SECOND_NS: Final = 1_000_000_000
 MAX_REFUSALS: Final = 6
-"""A turn that the model claims as done this often in a row counts as done."""
+"""Number of claims in a row after which a turn counts as done."""
 
 
 @dataclass(frozen=True)
@@ -109,10 +109,10 @@ def limit_distance(plan: Plan, turn: TurnDistances) -> Plan:
 
 @dataclass(frozen=True)
 class DecodingContext:
-    """What the rules know before a generation; the default constrains nothing."""
+    """Inputs of the rules for one generation; the default constrains nothing."""
 
     before: Progress | None = None
-    """The progress of the text before."""
+    """The progress of the previous text."""
     follow: str = FREE
     """Which progress may follow it, one of FOLLOWS."""
     turn: TurnDistances | None = None
@@ -122,7 +122,7 @@ class DecodingContext:
     def after(self, text: str, constraint: TextConstraint) -> DecodingContext:
         """Return the context after a text that this one constrained, but for the turn.
 
-        A text without progress keeps the one before. A refused turn back is allowed next time.
+        A text without progress keeps the previous one. A refused turn back is allowed next time.
         """
         before = parse_progress(text) or self.before
         follow = EITHER_WAY if constraint.refused == BACK else ONWARD
@@ -159,7 +159,7 @@ class LineConstraint:
     """Constrains one line of a text to some lines of tokens, the first of them preferred.
 
     The line begins where the model chooses their common first token. Where the model chooses a token that none of the
-    remaining lines has, the preferred remaining line replaces its choice. A text without such a line is left alone.
+    remaining lines has, the preferred remaining line replaces its choice. A text without such a line is unchanged.
     """
 
     def __init__(self, lines: Sequence[Line], refused: Mapping[str, Sequence[Line]] | None = None) -> None:
@@ -255,9 +255,9 @@ class TextConstraint:
 
 
 class TurnEstimator:
-    """Estimates the next turn: its distance from the last observations, and from headings whether it can be done.
+    """Estimates the next turn: its distance from the last observations, and from headings whether it may be done.
 
-    Pictures alone place a turn late, and the robot misses a turn that is named late. For one thread.
+    The model alone places a turn late, and the robot misses a turn that is named late. For one thread.
     """
 
     def __init__(self) -> None:
@@ -303,7 +303,7 @@ class TurnEstimator:
         self, progress: Progress | None, turn: TurnObservation | None, anchor: EncodedFrame, *, overruled: bool,
         claimed: bool,
     ) -> None:  # fmt: skip
-        """Take what a text about the frame `anchor` gives; a text without a turn ends the observations.
+        """Take the turn of a text about the frame `anchor`; a text without a turn ends the observations.
 
         `overruled`: the model chose another progress, or the text was cut short, so its plan is unknown; `claimed`: it
         named a turn as done that cannot be.
@@ -348,7 +348,7 @@ class _Rotation:
     """Largest rotation to each side since some instant."""
 
     def __init__(self, settling: str | None, from_ns: int) -> None:
-        """`settling`: side of the turn before, which the robot may still be making from `from_ns` on."""
+        """`settling`: side of the previous turn, which the robot may still be making from `from_ns` on."""
         self._settling, self._from_ns = settling, from_ns
         self._recent: deque[tuple[int, float]] = deque()
         self._start_rad = {LEFT: math.inf, RIGHT: math.inf}
@@ -357,7 +357,7 @@ class _Rotation:
         self._made_ns: dict[str, int] = {}
 
     def put(self, stamp_ns: int, heading_rad: float) -> None:
-        """Take a heading that counts on beyond half a revolution."""
+        """Take a heading that is unwrapped beyond half a revolution."""
         self._recent.append((stamp_ns, heading_rad))
         while len(self._recent) > 1 and self._recent[1][0] <= stamp_ns - SECOND_NS:
             self._recent.popleft()
@@ -365,7 +365,7 @@ class _Rotation:
         if self._from_ns <= then_ns <= stamp_ns - SECOND_NS and abs(heading_rad - then_rad) < SETTLED_RAD:
             self._settling = None
         for side, aside_rad in ((LEFT, heading_rad), (RIGHT, -heading_rad)):
-            # While the turn before goes on, this one begins at the present heading.
+            # During the previous turn, this one begins at the present heading.
             start_rad = aside_rad if side == self._settling else min(self._start_rad[side], aside_rad)
             self._start_rad[side], self._now_rad[side] = start_rad, aside_rad - start_rad
             self._most_rad[side] = max(self._most_rad[side], aside_rad - start_rad)

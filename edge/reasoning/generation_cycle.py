@@ -1,4 +1,4 @@
-"""When a generation starts, when its result becomes the semantic state, and when reasoning ends until the next start.
+"""Decides when a generation starts, when its result becomes the semantic state, and when reasoning ends for good.
 
 Paper, Algorithms 3 and 4 and appendix D. Pure: no thread, no clock, no model. Two shells run this cycle:
 `edge.run.reasoning_loop` in real time on the robot, `VirtualTimeReasoner` in the benchmark's virtual time.
@@ -35,14 +35,14 @@ SETTLE_S = 1.0
 
 @dataclass(frozen=True)
 class ReasoningBudget:
-    """What is allowed from the next generation on; control is never part of it."""
+    """Limits of reasoning from the next generation on; they never concern control."""
 
     allowed: bool = True
     """False: no generation is started, and one under way is cancelled."""
     pause_s: float = 0.0
     """Rest between two generations."""
     max_new_tokens: int | None = None
-    """Cap below the artifacts' own; None: no other cap."""
+    """Token cap below the artifacts' own; None: no further cap."""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.pause_s) and self.pause_s >= 0):
@@ -67,7 +67,7 @@ class Mode(Enum):
 
 @dataclass(frozen=True)
 class ReasoningConfig:
-    """What a generation is made of: the ages of its frames, the length of its text, the mode and the decoding."""
+    """Configuration of a generation: frame ages, text length, mode and decoding."""
 
     frame_offsets_s: tuple[float, ...]
     """Ages of the frames relative to the newest one, s; 0 is the newest."""
@@ -102,10 +102,10 @@ class Anchored:
 
 @dataclass(frozen=True)
 class FrameMissed:
-    """The generation under way was given up because there is no frame at the planned instant."""
+    """The generation under way was abandoned: there is no frame at the planned instant."""
 
     newest_ns: int | None = None
-    """The next generation needs a frame newer than this; None: any frame will do."""
+    """The next generation needs a frame newer than this, ns; None: any frame."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class Finished:
     new_tokens: int
     has_waypoints: bool
     needs_waypoints: bool
-    """The policy is guided by waypoints alone, so a text without waypoints is of no use to it."""
+    """The policy is guided by waypoints alone, so it cannot use a text without waypoints."""
 
 
 Event = Anchored | FrameMissed | Cancelled | Failed | Finished
@@ -136,32 +136,32 @@ Event = Anchored | FrameMissed | Cancelled | Failed | Finished
 
 @dataclass(frozen=True)
 class CycleInputs:
-    """What the cycle needs to know at one instant."""
+    """Inputs of the cycle at one instant."""
 
     frames: Sequence[tuple[int, SE2]] = ()
     """Capture stamps, ns, and poses `T_odom_base` of the newest two frames, oldest first; read while idle only."""
     request: int = 0
-    """Number of the newest request. A higher number replaces the generation under way."""
+    """Number of the newest request; an increase replaces the generation under way."""
     budget: ReasoningBudget = UNLIMITED
     stopping: bool = False
-    """The run ends: start nothing, and do not count what is interrupted."""
+    """The run ends: start nothing, and do not count the interrupted generation."""
     event: Event | None = None
-    """What the generation under way reports."""
+    """Report of the generation under way."""
 
 
 class Action(Enum):
-    """What the shell does next."""
+    """The shell's next action."""
 
     WAIT = "wait"
     """Nothing to do."""
     START = "start"
     """Start a generation with the newest frames and at most `max_new_tokens` tokens."""
     CONTINUE = "continue"
-    """Go on with the generation under way."""
+    """Continue the generation under way."""
     INTERRUPT = "interrupt"
     """End the generation under way, then report `Cancelled`."""
     HOLD = "hold"
-    """Keep the finished result back until its release time."""
+    """Hold the finished result until its release time."""
     PUBLISH = "publish"
     """Make the result the semantic state."""
     DISCARD = "discard"
@@ -170,7 +170,7 @@ class Action(Enum):
 
 @dataclass(frozen=True)
 class CycleOutputs:
-    """What the shell does, and with which limits."""
+    """The shell's next action and its limits."""
 
     action: Action
     max_new_tokens: int
@@ -188,12 +188,12 @@ class _Phase(Enum):
 
 
 def seen_standing(frames: Sequence[tuple[int, SE2]], halted_ns: int | None) -> bool:
-    """Whether a generation may begin with the newest of these frames: a robot that was halted still coasts.
+    """Return whether a generation may begin with the newest of these frames: the robot must stand.
 
-    What it sees then is not what it sees from where it will start to drive (paper, appendix D).
+    A halted robot still coasts, so its frame differs from the one where it will start to drive (paper, appendix D).
 
-    `frames`: stamp, ns, and pose `T_odom_base` of the newest ones, oldest first; `halted_ns`: when the robot was told
-    to stand, None in a mode that drives on. The speed is the mean between the newest two.
+    `frames`: stamp, ns, and pose `T_odom_base` of the newest ones, oldest first; `halted_ns`: instant of the halt
+    command, None in a mode that keeps driving. The speed is the mean between the newest two.
     """
     if not frames:
         return False
@@ -212,7 +212,7 @@ def seen_standing(frames: Sequence[tuple[int, SE2]], halted_ns: int | None) -> b
 
 
 class GenerationCycle:
-    """Decides about one generation at a time. One thread calls `step`; any thread may read the counts."""
+    """State machine of one generation at a time. One thread calls `step`; any thread may read the counts."""
 
     def __init__(self, config: ReasoningConfig) -> None:
         self._token_limit = config.token_limit
@@ -232,14 +232,14 @@ class GenerationCycle:
         self.failed = 0
         self.cancelled = 0
         self.missed_frames = 0
-        """Generations given up because there was no frame at the planned instant."""
+        """Generations abandoned because there was no frame at the planned instant."""
         self.invalid_texts = 0
         """Complete texts that do not follow the grammar; a text that was cut short is not counted."""
         self.invalid_in_a_row = 0
         """The same, counted since the last valid text."""
 
     def step(self, inputs: CycleInputs, now_ns: int) -> CycleOutputs:
-        """Take in what was reported and return what to do now; pure apart from this object's own state."""
+        """Take the inputs and return the next action; pure apart from this object's own state."""
         if inputs.event is not None and self._phase is _Phase.RUNNING:
             self._take(inputs.event, inputs.stopping, now_ns)
         action = self._next(inputs, now_ns)
@@ -285,7 +285,7 @@ class GenerationCycle:
         return Action.START
 
     def _may_start(self, inputs: CycleInputs, now_ns: int) -> bool:
-        """Whether every pause is over and there is a frame that no generation has used."""
+        """Return whether every pause is over and there is a frame that no generation has used."""
         if self.failure is not None or inputs.stopping or not inputs.budget.allowed or now_ns < self._retry_ns:
             return False
         if not inputs.frames or inputs.frames[-1][0] <= self._anchor_ns:
@@ -300,7 +300,7 @@ class GenerationCycle:
             self.invalid_in_a_row = 0 if result.has_waypoints else self.invalid_in_a_row + 1
             self.invalid_texts += not result.has_waypoints
         if result.needs_waypoints and not result.has_waypoints:
-            return Action.DISCARD  # the earlier state grows older, and the supervisor slows the robot down by its age
+            return Action.DISCARD  # the semantic state ages, and the supervisor slows the robot down by its age
         self.published += 1
         if self.drive_until_ns is not None:
             self.drive_until_ns = now_ns + round(SYNC_DRIVE_S * 1e9)

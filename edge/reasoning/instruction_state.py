@@ -1,8 +1,7 @@
-"""What is remembered while one instruction is followed: the path, the last progress, the next turn, where to stop.
+"""The memory of one instruction: the path, the last progress, the next turn, the stop.
 
-Shared by the reasoning thread and by the benchmark's virtual time, so that both give the model the same prompt. It is
-fed from the token ring, where every frame has its pose at capture: what is remembered does not depend on how often a
-generation runs.
+The reasoning thread and the benchmark's virtual time share it, so that both give the model the same prompt. Its poses
+come from the token ring, where every frame has its pose at capture: the memory does not depend on the generation rate.
 """
 
 from __future__ import annotations
@@ -15,30 +14,30 @@ from typing import Final
 
 from edge.core.geometry import SE2, wrap_angle
 from edge.reasoning.decoding_rules import DONE, DecodingContext, TextConstraint, TurnEstimator
-from edge.reasoning.path_memory import PERIOD_NS, PathMemory, Way
+from edge.reasoning.path_memory import PERIOD_NS, PastPath, PathMemory
 from edge.state.reasoning_text import ReasoningText, Stop, parse_text
 from edge.state.ring import EncodedFrame, TokenRing
 from edge.state.switches import Decoding
 
 MOST_FRAMES = 1 << 16
-"""More frames than a ring holds."""
+"""Number of frames, more than the capacity of a ring."""
 NEAR_M: Final = 4.0
 """Largest distance of goal and stop in a text that places a stop, m."""
 RECENT_TEXTS: Final = 3
 AGREEING_TEXTS: Final = 2
-"""This many of the RECENT_TEXTS have to place a stop."""
+"""Number of the RECENT_TEXTS that have to place a stop."""
 SAME_HEADING_RAD: Final = 0.7
 """Stops placed at a heading that differs by more than this, 40°, belong to another place."""
 STOP_NOW_M: Final = 0.5
 """Distance of "stop now", which is written below 1 m."""
 DROPPING_TEXTS: Final = 5
 CONTRADICTING_TEXTS: Final = 4
-"""This many of the last DROPPING_TEXTS drop the stop when they plan no stop nearby."""
+"""Number of the last DROPPING_TEXTS without a nearby stop that drop the stop."""
 COLOURS: Final = frozenset(("red", "orange", "yellow", "green", "blue", "purple", "white", "black", "grey", "brown"))
 
 
 class StopEstimator:
-    """Estimates where one instruction's texts plan to stop; for one thread."""
+    """Estimate of the stop that one instruction's texts plan; for one thread."""
 
     def __init__(self, instruction: str) -> None:
         """`instruction` names the goal."""
@@ -46,10 +45,10 @@ class StopEstimator:
         self._stops: deque[SE2 | None] = deque(maxlen=RECENT_TEXTS)
         self._contradicts: deque[bool] = deque(maxlen=DROPPING_TEXTS)
         self.T_odom_stop: SE2 | None = None
-        """Where to stop, at the robot's heading when it was placed; None while it is unknown."""
+        """Pose of the stop, with the robot's heading when it was placed; None while it is unknown."""
 
     def update(self, text: ReasoningText, T_odom_anchor: SE2) -> None:
-        """Take a complete text, as the model itself chose it, about a frame captured at a pose."""
+        """Take a complete text as the model chose it, before any rule, about a frame captured at a pose."""
         goal_m, stop_m = self._goal_m(text), _stop_m(text)
         last_leg = text.progress is not None and text.progress.is_last_leg
         stops = stop_m is not None and stop_m <= NEAR_M and last_leg
@@ -69,11 +68,11 @@ class StopEstimator:
             self.T_odom_stop = None
 
     def _goal_m(self, text: ReasoningText) -> float | None:
-        """Distance of the first object in view that the instruction names; None without any."""
+        """Return the distance of the first object in view that the instruction names, m; None without any."""
         return next((float(seen.distance_m) for seen in text.objects or () if self._names(seen.name)), None)
 
     def _names(self, name: str) -> bool:
-        """Whether the instruction has the name's words; a colour that it leaves out need not be there."""
+        """Return whether the instruction contains the name, with or without its colour."""
         words = _words(name)
         return self._has(words) or (words[0] in COLOURS and self._has(words[1:], uncoloured=True))
 
@@ -100,11 +99,11 @@ class InstructionMemory:
 
     @property
     def stop(self) -> SE2 | None:
-        """T_odom_stop: where the texts so far plan to stop; None while that is unknown."""
+        """T_odom_stop: the stop that the texts so far plan; None while it is unknown."""
         return self._stop.T_odom_stop
 
     def context(self, anchor: EncodedFrame) -> DecodingContext:
-        """Return what a generation with this newest frame is given, and constrained to."""
+        """Return the prompt's memory and the decoding context of a generation with this newest frame."""
         if self._decoding is Decoding.FREE:
             return DecodingContext(self._context.before)
         turn = self._turn
@@ -118,21 +117,21 @@ class InstructionMemory:
         if newest_ns is not None and (seen_ns is None or newest_ns >= seen_ns + PERIOD_NS):
             self._take(ring, newest_ns)
 
-    def way(self, ring: TokenRing, anchor: EncodedFrame) -> Way:
-        """Return the path up to a generation's newest frame, in its frame; later frames are left for the next call."""
+    def past_path(self, ring: TokenRing, anchor: EncodedFrame) -> PastPath:
+        """Return the path up to a generation's newest frame, in its robot frame; the next call takes later frames."""
         self._take(ring, anchor.stamp_ns)
-        # The ring may have dropped it while the generation waited for it.
+        # The ring may have dropped the frame during the generation's wait.
         self._put(anchor.stamp_ns, anchor.T_odom_base)
-        return self._path.way(anchor.T_odom_base)
+        return self._path.past_path(anchor.T_odom_base)
 
     def update(self, text: str, constraint: TextConstraint, anchor: EncodedFrame) -> None:
-        """Remember a published text's progress, and the model's own turn and stop."""
+        """Take a published text's progress, and the model's own turn and stop."""
         self._context = self._context.after(text, constraint)
         parts = parse_text(text)
         if constraint.has_plan and not constraint.overruled:
             self._stop.update(parts, anchor.T_odom_base)
         if parts.progress is None and not constraint.has_plan:
-            return  # the text was cut short before both
+            return  # the text was cut short before turn and stop
         overruled = constraint.overruled or not constraint.has_plan
         claimed = constraint.refused == DONE
         self._turn.update(parts.progress, constraint.turn, anchor, overruled=overruled, claimed=claimed)
@@ -150,7 +149,7 @@ class InstructionMemory:
 
 @dataclass(frozen=True)
 class Job:
-    """One instruction to reason about, and its memory."""
+    """One instruction and its memory."""
 
     number: int
     instruction: str
@@ -162,6 +161,6 @@ def _words(text: str) -> tuple[str, ...]:
 
 
 def _stop_m(text: ReasoningText) -> float | None:
-    """Distance ahead at which a text plans to stop; None for another plan."""
+    """Return the distance ahead at which a text plans to stop, m; None for another plan."""
     action = None if text.plan is None else text.plan.action
     return float(action.distance_m or STOP_NOW_M) if isinstance(action, Stop) else None

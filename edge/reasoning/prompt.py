@@ -1,4 +1,4 @@
-"""The VLM's prompt as segments: text tokens and at most one frame each, so that prefill can stop between them."""
+"""Builds the VLM's prompt as segments of text tokens and at most one frame, so that prefill can stop between them."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ import numpy as np
 import numpy.typing as npt
 from tokenizers import Tokenizer
 
-from edge.reasoning.path_memory import FARTHEST_M, MAX_POINTS, Way
+from edge.reasoning.path_memory import FARTHEST_M, MAX_POINTS, PastPath
 from edge.state.reasoning_text import MAX_COUNT, Progress, format_progress
 from edge.state.ring import EncodedFrame
 
 SYSTEM = "Drive through people. Describe the situation, then waypoints."
 MAX_INSTRUCTION_CHARS = 400
-EXAMPLE_WAY: Way = (
+EXAMPLE_PAST_PATH: PastPath = (
     (-31.6, 16.6), (-31.1, 4.0), (-20.3, 1.9), (-12.0, -0.8), (-8.2, 0.4), (-6.1, 0.7), (-2.4, 0.1), (0.0, 1.5)
 )  # fmt: skip
 EXAMPLE_BEFORE = Progress(2, 3, 1)
-"""A prompt of the usual length is timed and planned with these: all points of a way indoors."""
-LONGEST_WAY: Way = ((-FARTHEST_M, -FARTHEST_M),) * MAX_POINTS
+"""Past motion of a prompt of usual length, for timing and planning: all points of an indoor path."""
+LONGEST_PAST_PATH: PastPath = ((-FARTHEST_M, -FARTHEST_M),) * MAX_POINTS
 LONGEST_BEFORE = Progress(MAX_COUNT, MAX_COUNT, MAX_COUNT)
-"""With these a prompt is as long as it can become while an instruction is followed."""
+"""Past motion of the longest possible prompt."""
 
 
 class InstructionError(ValueError):
-    """An instruction that cannot be given to the model."""
+    """An instruction that the model cannot take."""
 
 
 @dataclass(frozen=True)
@@ -42,14 +42,14 @@ class PromptIds:
 
 @dataclass(frozen=True)
 class Segment:
-    """Consecutive prompt tokens; `tokens` are the visual tokens [1, N, D] of the frame inside, if there is one."""
+    """Consecutive prompt tokens; `tokens`: visual tokens [1, N, D] of its frame, None without a frame."""
 
     ids: tuple[int, ...]
     tokens: npt.NDArray[np.float32] | None
 
 
 def check_instruction(text: str) -> str:
-    """The instruction in one line; raises InstructionError when it is empty or longer than 400 characters."""
+    """Return the instruction in one line; raises InstructionError when it is empty or over 400 characters."""
     line = " ".join(text.split())
     if not line:
         raise InstructionError("instruction is empty: expected a sentence such as 'walk to the vending machine'")
@@ -65,7 +65,7 @@ class PromptBuilder:
 
     def __init__(self, tokenizer: Tokenizer, ids: PromptIds, frame_tokens: int) -> None:
         self._tokenizer = tokenizer
-        # An operator's text that spells "<|im_end|>" must stay text: special ids are written by this class alone.
+        # An operator's text that spells "<|im_end|>" must stay text: only this class writes special ids.
         self._tokenizer.encode_special_tokens = True
         self._ids = ids
         self._frame_tokens = frame_tokens
@@ -74,16 +74,15 @@ class PromptBuilder:
         return list(self._tokenizer.encode(text, add_special_tokens=False).ids)
 
     def build(
-        self, frames: Sequence[EncodedFrame], instruction: str, way: Way = (), before: Progress | None = None
+        self, frames: Sequence[EncodedFrame], instruction: str, past_path: PastPath = (), before: Progress | None = None
     ) -> list[Segment]:
-        """One segment a frame, oldest first, then what depends on the newest frame; without a way: an instruction's
-        first prompt."""
-        return [*(self.frame(n, frame, instruction) for n, frame in enumerate(frames, 1)), self.tail(way, before)]
+        """Return one segment per frame, oldest first, then the tail; without a path: an instruction's first prompt."""
+        return [*(self.frame(n, frame, instruction) for n, frame in enumerate(frames, 1)), self.tail(past_path, before)]
 
     def frame(self, number: int, frame: EncodedFrame, instruction: str) -> Segment:
-        """Frame `number` (from 1, oldest first); the first one carries the prompt's start with the instruction.
+        """Return the segment of frame `number`, from 1, oldest first; the first includes the prompt's start.
 
-        Nothing in it depends on later frames, so it can be prefilled before they have been captured.
+        It does not depend on later frames, so it can be prefilled before they are captured.
         """
         ids = self._ids
         head: list[int] = []
@@ -93,19 +92,22 @@ class PromptBuilder:
         image = [ids.img_start, *[ids.img_context] * self._frame_tokens, ids.img_end]
         return Segment((*head, *self._text(f"Frame {number}:"), *image, *self._text("\n")), frame.tokens)
 
-    def tail(self, way: Way, before: Progress | None) -> Segment:
-        """What follows the frames: the path since the instruction began, in the frame of the newest of them, the
-        progress of the text before (None: no such), and the assistant's turn."""
+    def tail(self, past_path: PastPath, before: Progress | None) -> Segment:
+        """Return the segment after the frames: the path since the instruction began, in the newest frame's robot
+        frame, the previous text's progress (None: none), and the assistant's turn."""
         ids = self._ids
-        text = [*self._text(f"Past motion: {format_past_motion(way)}\nBefore: {format_before(before)}"), ids.im_end]
+        text = [
+            *self._text(f"Past motion: {format_past_motion(past_path)}\nBefore: {format_before(before)}"),
+            ids.im_end,
+        ]
         return Segment((*text, *self._text("\n"), ids.im_start, *self._text("assistant\n")), None)
 
 
-def format_past_motion(way: Way) -> str:
-    """Where the robot has been, in its own frame now: "(-1.4, 0.0) (0.0, 2.1)" in m, oldest first."""
-    return " ".join(f"({x_m:.1f}, {y_m:.1f})" for x_m, y_m in way) or "none"
+def format_past_motion(past_path: PastPath) -> str:
+    """Format the path in the current robot frame, m, oldest first: "(-1.4, 0.0) (0.0, 2.1)"."""
+    return " ".join(f"({x_m:.1f}, {y_m:.1f})" for x_m, y_m in past_path) or "none"
 
 
 def format_before(before: Progress | None) -> str:
-    """Progress of the text before, in canonical form alone: that text is untrusted."""
+    """Format the previous text's progress in canonical form, since that text is untrusted."""
     return "none." if before is None else format_progress(before)

@@ -1,6 +1,6 @@
-"""Arming: asks the bridge until the robot stands, however long an operator takes where the robot file wants one.
+"""Arms the robot through the bridge, and stops it until the bridge confirms the stop.
 
-And its opposite: asks the bridge until it confirms that the robot was stopped.
+Arming waits without limit for an operator where the robot file requires one.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from firmware_bridge.client import BridgeStatus, BridgeUnavailable
 POLL_S: Final = 0.05
 CONFIRM_POLL_S: Final = 0.01
 ASK_AGAIN_S: Final = 1.0
-"""How often the bridge is asked again while it waits for an operator."""
+"""Period at which the arm request is repeated while the bridge waits for an operator."""
 ANSWER_NS: Final = 200_000_000
-"""A status that is younger than the question by this much was made after it was read: ten steps of the bridge."""
+"""A status this much newer than the request is an answer to it: ten steps of the bridge."""
 WAITING: Final = "waiting to be armed"
 ARMING: Final = "arming"
 LASTS_S: Final = 6.0
-"""What is in the way and goes by itself within this time is no reason to refuse."""
+"""An obstacle to arming that clears within this time is no reason to refuse."""
 
 
 class RefusedError(RuntimeError):
@@ -28,7 +28,7 @@ class RefusedError(RuntimeError):
 
 
 class StoppedEarlyError(RuntimeError):
-    """A stop was asked for before the robot had been armed."""
+    """A stop was requested before the robot was armed."""
 
 
 class Bridge(Protocol):
@@ -55,7 +55,7 @@ class StoppableBridge(Protocol):
 
 
 class _Gate:
-    """Whether the bridge may be asked: nothing must be in the way that would keep the robot from driving."""
+    """Checks whether arming may be requested: nothing may keep the robot from driving."""
 
     def __init__(
         self, in_the_way: Callable[[], str], operator: bool, clock: Callable[[], int], say: Callable[[str], None]
@@ -69,7 +69,7 @@ class _Gate:
         self.why = ""
 
     def is_clear(self, status: BridgeStatus | None) -> bool:
-        """Check once. Raises RefusedError when it stays in the way although the robot may be armed."""
+        """Check once. Raises RefusedError when an obstacle remains although the robot may be armed."""
         now_ns, self.why = self._clock(), self._in_the_way()
         permitted = not self._operator or (status is not None and status.blocked_by == "none")
         if not self.why or not permitted or self._since_ns is None:
@@ -148,14 +148,14 @@ def disarm(
     clock: Callable[[], int] = time.monotonic_ns,
     sleep: Callable[[float], None] = time.sleep,
 ) -> bool:
-    """Stop the robot; whether within `limit_s` only zeros went out and the robot reported that it stands still."""
+    """Stop the robot; return whether within `limit_s` only zeros went out and the robot reported standing still."""
     asked_ns = clock()
     while clock() - asked_ns < limit_s * 1e9:
-        bridge.stop()  # again and again: once more changes nothing, and one may get lost in a full queue
+        bridge.stop()  # repeated: a second request changes nothing, and one may be lost in a full queue
         try:
             status = bridge.poll()
         except BridgeUnavailable:
-            return False  # the end of the connection stops the robot, but nothing confirms it
+            return False  # closing the connection stops the robot, but nothing confirms it
         stopped = status is not None and status.stamp_ns >= asked_ns and status.state in ("stopped", "disarmed")
         if status is not None and stopped and status.zero_after_stop and status.motion == "still":
             return True
@@ -164,7 +164,7 @@ def disarm(
 
 
 def _ask(bridge: Bridge, clock: Callable[[], int]) -> int:
-    """When it was asked, ns."""
+    """Instant of the request, ns."""
     now_ns = clock()
     bridge.arm()
     return now_ns

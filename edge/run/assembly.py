@@ -41,7 +41,7 @@ HISTORY_MARGIN_S = 6.0
 
 @dataclass(frozen=True)
 class RunOptions:
-    """What a run was asked for."""
+    """The options of a run."""
 
     instruction: str
     mode: Mode
@@ -49,9 +49,9 @@ class RunOptions:
     release_delay: ReleaseDelay
     record: Path | None
     instructions: Path | None = None
-    """Where further instructions are taken while it drives."""
+    """Socket that takes further instructions while the robot drives."""
     switches: SwitchOptions = field(default_factory=SwitchOptions)
-    """Decoding rules and recoveries that were asked for."""
+    """Decoding rules and recoveries of the command line."""
 
     def switches_for(self, artifacts: Artifacts) -> Switches:
         """Return what is in force with these artifacts; the robot stands at the goal by default. Raises ConfigError."""
@@ -64,7 +64,7 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class Engines:
-    """What computes, opened and warmed up."""
+    """The model's graphs, opened and warmed up."""
 
     artifacts: Artifacts
     policy: Policy
@@ -75,7 +75,7 @@ class Engines:
 
 @dataclass(frozen=True)
 class Loops:
-    """What runs, not started yet."""
+    """The threads and monitors of a run, not started yet."""
 
     power: PowerMonitor
     control: ControlLoop
@@ -101,7 +101,7 @@ def assemble(
     seconds = max(runtime.frame_offsets_s) + HISTORY_MARGIN_S
     switches = options.switches_for(artifacts)
     shared = SharedState(TokenRing(math.ceil(seconds * 1e9 / period_ns), engines.policy.tokens_shape), SemanticSlot())
-    # The monitor asks the loops what they do, the loops ask the monitor what they may: each by the time it runs.
+    # The monitor reads the loops' activity, and the loops read the monitor's budget: both exist before either runs.
     loops: list[tuple[ControlLoop, ReasoningLoop]] = []
 
     def activity() -> Activity:
@@ -175,8 +175,8 @@ def assemble(
 
 
 def semantic_config(artifacts: Artifacts, mode: Mode) -> SemanticConfig:
-    """How old an answer may be, by what the policy was trained for; raises ArtifactError."""
-    # What an untrained model writes is not in the agreed form, and is no fault of the robot's.
+    """Return how old a semantic state may be, from the policy's training; raises ArtifactError."""
+    # An untrained model writes text that does not follow the grammar; that is no fault of the robot.
     judge_text = artifacts.trained and mode is not Mode.NO_REASONING
     trained_s = read_power_plan(artifacts).max_delay_s
     if not math.isfinite(trained_s):

@@ -39,7 +39,7 @@ THINKING = "thinking"
 """Reason for standing in sync mode while a generation is under way."""
 
 OffsetCovariance = Callable[[int], npt.NDArray[np.float64] | None]
-"""3×3 covariance (m², rad²) of the motion since an anchor's stamp in ns; None while it is not known."""
+"""3×3 covariance (m², rad²) of the motion since an anchor's stamp in ns; None while it is unavailable."""
 
 
 class CommandSink(Protocol):
@@ -66,7 +66,7 @@ class ControlStatistics:
     unsent: int = 0
     plans: int = 0
     plans_not_finite: int = 0
-    """Of `plans`, those that no robot can be driven by: see `edge.motion.controller.is_plan`."""
+    """Number of `plans` that cannot drive a robot: see `edge.motion.controller.is_plan`."""
     reasons: dict[str, int] = field(default_factory=dict)
     """Ticks by what decided their velocity: "ok", the reason for zero, or a recovery's (`edge.motion.recovery`)."""
     faults: dict[str, int] = field(default_factory=dict)
@@ -82,7 +82,7 @@ class ControlConfig:
     step_s: float
     """Time between two points of the policy's trajectory, s."""
     trained_delay_s: float = SemanticConfig.trained_delay_s
-    """Largest Δt that the policy was trained for, s; it is given no larger one."""
+    """Largest Δt that the policy was trained for, s; a larger one is clamped to it."""
     switches: Switches = field(default_factory=Switches)
     """Which recoveries are in force."""
 
@@ -96,7 +96,7 @@ class ControlConfig:
 
 @dataclass(frozen=True)
 class ControlSources:
-    """What the control loop reads of the robot; no call may wait."""
+    """The robot's inputs to the control loop; no call may wait."""
 
     newest_frame: Callable[[], Frame | None]
     history: PoseHistory
@@ -105,7 +105,7 @@ class ControlSources:
 
 @dataclass(frozen=True)
 class CommandChain:
-    """What turns a trajectory into a command, and what may hold the robot."""
+    """The parts that turn a trajectory into a command or hold the robot."""
 
     controller: Controller
     watch: Watch
@@ -113,18 +113,18 @@ class CommandChain:
 
     @classmethod
     def standard(cls, controller: Controller, period_ns: int) -> CommandChain:
-        """Monitors that know only what the control loop itself sees."""
+        """Return monitors that read nothing but the control loop's own inputs."""
         return cls(controller, Watch(WatchConfig.standard(controller.config, period_ns)), Supervisor())
 
 
 @dataclass(frozen=True)
 class ControlOutputs:
-    """Where commands, log records and ticks are reported."""
+    """Sinks of the commands, log records and ticks."""
 
     sink: CommandSink
     recorder: Recorder | None = None
     on_tick: Callable[[bool], None] = lambda _on_time: None
-    """Takes after every tick whether it was on time; it must neither wait nor raise."""
+    """Called after every tick with whether it was on time; it must neither wait nor raise."""
 
 
 class ControlLoop:
@@ -166,7 +166,7 @@ class ControlLoop:
         """Tick at `epoch_ns` plus whole periods until `stop` or `end_ns`; deadlines that have passed are skipped.
 
         Returns why the bridge or the supervisor stopped the robot (`ended_by` says which), else None; raises
-        BridgeUnavailable when the bridge has gone.
+        BridgeUnavailable when the connection to the bridge has ended.
         """
         self._watch.begin()
         deadline_ns, period_ns = epoch_ns, self._config.period_ns
@@ -193,7 +193,7 @@ class ControlLoop:
     def _ended_by_bridge(self, status: BridgeStatus, now_ns: int) -> str:
         """Report the fault to the supervisor; returns why the bridge ended the run, for the operator."""
         self.ended_by = "bridge"
-        fault, why = "bridge-hung", f"no word from it for {(now_ns - status.stamp_ns) / 1e9:.1f} s"
+        fault, why = "bridge-hung", f"no status from it for {(now_ns - status.stamp_ns) / 1e9:.1f} s"
         if status.state == "stopped":
             fault, why = FAULT_OF_CAUSE.get(status.cause, ""), status.reason
         if fault:
@@ -294,7 +294,7 @@ class ControlLoop:
         return True
 
     def _wait_until(self, deadline_ns: int) -> bool:
-        """True when `stop` was set meanwhile; returns early when the supervisor has stopped the run."""
+        """Wait; return True when `stop` was set meanwhile, and return early when the supervisor has stopped the run."""
         while True:
             left_s = max(0, deadline_ns - self._clock()) / 1e9
             if self._stop.wait(min(left_s, URGENT_POLL_S)):
@@ -327,7 +327,7 @@ class ControlLoop:
             self._recorder.put("/fault", event.stamp_ns, record)
 
     def _hold(self, semantic: SemanticState | None, pose: StampedPose | None, now_ns: int) -> str | None:
-        """Why the robot must stand, whatever the trajectory; None: it may drive."""
+        """Return why the robot must stand whatever the trajectory; None: it may drive."""
         if self.supervision.speed_scale <= 0:
             return self.supervision.active[0] if self.supervision.active else "not-supervised"
         until_ns = self._slot.drive_until_ns
@@ -373,12 +373,12 @@ class ControlLoop:
             return np.full((1, 3), np.nan, dtype=np.float32)
 
     def _offset_sd(self, anchor_ns: int) -> list[float] | None:
-        """Standard deviations (m, m, rad) of the motion since the anchor, for the log."""
+        """Return the standard deviations (m, m, rad) of the motion since the anchor, for the log."""
         covariance = self._sources.offset_covariance(anchor_ns)
         return None if covariance is None else [float(v) for v in np.sqrt(np.maximum(np.diag(covariance), 0.0))]
 
     def _seconds(self, trajectory: npt.NDArray[np.float32] | None) -> list[list[float]] | None:
-        """The trajectory at whole seconds, as the flight log keeps it."""
+        """Return the trajectory at whole seconds, as the flight log keeps it."""
         if trajectory is None:
             return None
         every = max(1, round(TARGET_TIME_S / self._config.step_s))
@@ -386,7 +386,7 @@ class ControlLoop:
 
 
 def _leading_waypoints(semantic: SemanticState | None, offset: SE2) -> npt.NDArray[np.float32] | None:
-    """The last text's waypoints [points, 2], m in the robot's frame now; None for a text that plans to wait."""
+    """Return the last text's waypoints [points, 2], m in the current robot frame; None where it plans to wait."""
     if semantic is None or semantic.waypoints is None or semantic.waits:
         return None
     points: npt.NDArray[np.float32] = waypoints_now(semantic.waypoints, offset)[0]

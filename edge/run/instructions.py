@@ -1,6 +1,6 @@
-"""New instructions for a runner that drives: a local socket, one JSON object a datagram, never waited for.
+"""Receives new instructions while the robot drives: a local socket, one JSON object a datagram, without waiting.
 
-A stop phrase is no instruction: it stops the robot, and no instruction is accepted after it.
+A stop phrase is not an instruction: it stops the robot, and no instruction is accepted after it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from edge.reasoning.prompt import InstructionError, check_instruction
 from edge.run.stop_phrase import is_stop_phrase
 
 MAX_BYTES: Final = 4096
-"""Of a datagram: 400 characters of an instruction, each in the longest form that JSON has for it."""
+"""Largest datagram, bytes: 400 characters of an instruction, each in its longest JSON escape."""
 MAX_A_POLL: Final = 4
 
 
@@ -27,24 +27,24 @@ class InstructionSocket:
 
     The answer to a stop phrase is `{"stopped": TEXT, "confirmed": BOOL, "bridge": PATH}`.
 
-    Only the user whose process this is may write to it (mode 0600). Raises OSError when the path is taken or cannot be
-    made.
+    Only this process's user may write to the socket (mode 0600). Raises OSError when the path is in use or cannot be
+    created.
     """
 
     def __init__(self, path: Path, check: Callable[[str], None], stop: Callable[[], bool], bridge: Path) -> None:
-        """`check` raises InstructionError for a text that the model has no room for.
+        """`check` raises InstructionError for a text that does not fit the model's context.
 
         `stop` stops the robot and returns whether its bridge, which listens at `bridge`, has confirmed it.
         """
         self.stopped = False
-        """Whether a stop phrase has come."""
+        """Whether a stop phrase has been received."""
         self._path = path
         self._check = check
         self._stop = stop
         self._bridge = bridge
         with contextlib.suppress(OSError):
             if stat.S_ISSOCK(path.lstat().st_mode) and not _answers(path):
-                path.unlink()  # of a runner that was killed
+                path.unlink()  # left by a runner that was killed
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         umask = os.umask(0o177)
         try:
@@ -57,7 +57,7 @@ class InstructionSocket:
         self._socket.setblocking(False)
 
     def poll(self) -> str | None:
-        """The newest good instruction since the last poll, in one line; None without one, and after a stop phrase."""
+        """Return the newest valid instruction since the last poll; None without one or after a stop phrase."""
         newest: str | None = None
         for _ in range(MAX_A_POLL):
             try:
@@ -87,21 +87,21 @@ class InstructionSocket:
         self._path.unlink(missing_ok=True)
 
     def _answer(self, sender: str | None, answer: dict[str, str | bool]) -> None:
-        if sender:  # one that is not bound has no address
-            with contextlib.suppress(OSError):  # it has gone or does not read
+        if sender:  # an unbound sender has no address
+            with contextlib.suppress(OSError):  # the sender has closed its socket or does not read
                 self._socket.sendto(json.dumps(answer).encode(), sender)
 
 
 def check_first_instruction(text: str) -> str:
-    """The instruction to begin a run with, in one line; raises InstructionError, also for a stop phrase."""
+    """Return a run's first instruction in one line; raises InstructionError, also for a stop phrase."""
     line = check_instruction(text)
     if is_stop_phrase(line):
-        raise InstructionError(f"instruction {line!r} is a stop phrase: expected what the robot is to do")
+        raise InstructionError(f"instruction {line!r} is a stop phrase: expected an instruction to drive")
     return line
 
 
 def parse(data: bytes) -> str:
-    """The instruction of a datagram, in one line; raises InstructionError."""
+    """Return a datagram's instruction in one line; raises InstructionError."""
     if len(data) > MAX_BYTES:
         raise InstructionError(f"expected at most {MAX_BYTES} bytes, found {len(data)}")
     try:

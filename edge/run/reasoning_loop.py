@@ -38,9 +38,9 @@ from edge.state.ring import EncodedFrame
 from edge.state.semantic import SemanticState, SharedState
 
 IDLE_S = 0.02
-"""Pause between two checks for work, and between two checks of a result that is held back, s."""
+"""Pause between two checks for work or for the release of a held result, s."""
 FRAME_POLL_S = 0.002
-"""Period at which a generation looks for its newest frame after prefilling the older ones, s."""
+"""Polling period for the newest frame after the older ones are prefilled, s."""
 ANCHOR_MARGIN_NS = 1_000_000_000
 """Time that a generation waits for its newest frame beyond the latest usable capture, ns."""
 PREFIXES = 3
@@ -57,9 +57,9 @@ class ReasoningSchedule:
     """How the reasoning thread shares the machine, and when its results are released."""
 
     release_delay_s: Callable[[], float] = lambda: 0.0
-    """Time by which the next result is held back after it was computed, s."""
+    """Returns the release delay of the next result, s."""
     budget: Callable[[], ReasoningBudget] = lambda: UNLIMITED
-    """The power governor's budget; called before every graph call, so it must not wait."""
+    """Returns the power governor's budget; called before every graph call, so it must not wait."""
     give_way: GiveWay | None = None
     """Set where reasoning competes with control ticks for a core or the accelerator."""
     role: Role = REASONING_ROLE
@@ -69,7 +69,7 @@ class ReasoningSchedule:
 
 @dataclass(frozen=True)
 class ReasoningOutputs:
-    """Where the reasoning thread reports."""
+    """Sinks of the reasoning thread's log records and messages."""
 
     recorder: Recorder | None = None
     say: Callable[[str], None] = lambda _line: None
@@ -77,7 +77,7 @@ class ReasoningOutputs:
 
 
 class _MissedFrameError(RuntimeError):
-    """There is no frame at the planned instant, so the prefilled frames are of no use."""
+    """No frame was captured at the planned instant, so the prefilled frames are useless."""
 
     def __init__(self, newest_ns: int | None = None) -> None:
         super().__init__("no frame at the planned instant")
@@ -93,12 +93,12 @@ class _ComputeTime:
     since_ns: int | None = None
 
     def begin(self) -> int:
-        """Computing begins; returns now, ns."""
+        """Note that computing begins; return the current time, ns."""
         now_ns = self.since_ns = self.clock()
         return now_ns
 
     def end(self) -> None:
-        """Nothing is computed from now on; may be called twice."""
+        """Note that computing ends; a second call changes nothing."""
         since_ns, self.since_ns = self.since_ns, None
         if since_ns is not None:
             self.done_ns += self.clock() - since_ns
@@ -117,7 +117,7 @@ class ReasoningTimes:
     anchor_to_ready_ms: Samples = field(default_factory=lambda: Samples(SAMPLES))
     """Δt at release: from the newest frame's capture until the semantic state is published."""
     late_anchor_ms: Samples = field(default_factory=lambda: Samples(SAMPLES))
-    """How much longer Δt would be with the frame that was newest when the generation began."""
+    """Reduction of Δt against an anchor at the newest frame when the generation began."""
 
 
 class ReasoningLoop:
@@ -155,13 +155,13 @@ class ReasoningLoop:
         self._context_ns = 0
         self._computing = _ComputeTime(clock)
         self.cycle = GenerationCycle(config)
-        """Counts of generations, and why reasoning has ended; any thread may read them."""
+        """Counts of generations and the reason why reasoning has ended; any thread may read them."""
         self._slot.drive_until_ns = self.cycle.drive_until_ns
         self.times = ReasoningTimes()
         self.last_progress_ns = clock()
-        """Stamp at which this thread was last between two calls; it stays the same while a call hangs."""
+        """Stamp of the last instant between two calls, ns; it stays constant while a call hangs."""
         self.busy = False
-        """Whether a generation is under way; one that is finished and held back is not."""
+        """Whether a generation is computing; a finished result that is held back does not count."""
 
     @property
     def busy_ns(self) -> int:
@@ -190,7 +190,7 @@ class ReasoningLoop:
             under_way[1].set()
 
     def run(self) -> None:
-        """Loop until `stop`; a failed generation is counted and another one tried."""
+        """Run generations until `stop`; count failures and try again."""
         for line in enter(self._schedule.role):
             self._outputs.say(line)
         while not self._stop.is_set():
@@ -286,12 +286,12 @@ class ReasoningLoop:
         return True
 
     def _rest(self) -> None:
-        """The generation, if there was one, computes nothing any more."""
+        """End the generation under way, if any."""
         self._computing.end()
         self.busy = False
 
     def _await_anchor(self, plan: Anchor, task: GenerationTask, cancelled: Callable[[], bool]) -> EncodedFrame:
-        """The newest frame as planned, which may have to be waited for; the wait counts as no computing."""
+        """Wait for the planned newest frame and return it; the wait does not count as computing."""
         self._computing.end()
         stamp_ns = self._await_stamp(plan, cancelled)
         self._computing.begin()
@@ -301,7 +301,7 @@ class ReasoningLoop:
         return anchor
 
     def _await_stamp(self, plan: Anchor, cancelled: Callable[[], bool]) -> int:
-        """Stamp of the newest frame to use, ns. Gives up after a limited time, should the camera stop."""
+        """Return the stamp of the newest frame to use, ns; give up after a limited time in case the camera stops."""
         since_ns, limit_ns = self._clock(), 0
         while True:
             newest_ns = self._ring.newest_ns
@@ -309,7 +309,7 @@ class ReasoningLoop:
                 stamp_ns = plan.choose(newest_ns)
                 if stamp_ns is not None:
                     return stamp_ns
-                # Frames and this clock need not share their origin: by how much the newest is too early.
+                # Measured between frame stamps, since this clock's origin may differ from theirs.
                 limit_ns = limit_ns or plan.planned_ns - newest_ns + plan.late_ns + ANCHOR_MARGIN_NS
             if cancelled():
                 raise CancelledError
@@ -320,7 +320,7 @@ class ReasoningLoop:
     def _hold_back(
         self, task: GenerationTask, result: GenerationResult, finished_ns: int, release_ns: int
     ) -> tuple[CycleOutputs, int]:
-        """Wait until the result is released or dropped; returns what to do with it, and when that was decided, ns."""
+        """Wait until the result is released or dropped; return the decision and its instant, ns."""
         needs_waypoints = self._models.policy.guided_by_waypoints
         new_tokens, has_waypoints = result.generation.new_tokens, result.waypoints is not None
         now_ns = finished_ns

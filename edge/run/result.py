@@ -47,7 +47,7 @@ def run_result(
     faults: list[str],
     duration_s: float,
 ) -> dict[str, Any]:
-    """What happened; `faults` are lines for the operator, each of which ended the run or made it worthless."""
+    """The outcome of a run; `faults` are lines for the operator, each of which ended or invalidated the run."""
     ticks, cycle, times = control.statistics, reasoning.cycle, reasoning.times
     if (fault := plan_fault(ticks)) is not None:
         faults = [*faults, fault]
@@ -93,7 +93,7 @@ def run_result(
 
 
 def plan_fault(statistics: ControlStatistics) -> str | None:
-    """The fault of a run whose plans were never finite: the robot stood throughout; None for any other run."""
+    """Return the fault of a run in which no plan was finite, so the robot never moved; None for any other run."""
     if not statistics.plans or statistics.plans_not_finite < statistics.plans:
         return None
     return (

@@ -19,9 +19,9 @@ from firmware_bridge.core.config import OPERATOR_SUFFIX, SERVICE_SOCKET, runtime
 ANSWER_S = 2.0
 STOP_ANSWER_S = 3.0  # the runner waits up to 2 s for the robot to stand still
 STOP: Final = "stop"
-"""What the runner is sent for every stop phrase."""
+"""Text that the runner receives for every stop phrase."""
 ROBOT_FILE_SOCKET: Final = "bridge.sock"
-"""Name that the shipped robot files give the bridge's socket."""
+"""File name of the bridge's socket in the shipped robot files."""
 
 EXAMPLES = """examples:
   edge-run --artifacts out/nano --robot go2.toml --instructions say.sock --instruction "go down the corridor"
@@ -43,11 +43,11 @@ exit codes: 0 the runner has accepted the instruction, or the bridge has confirm
 
 
 class SayError(RuntimeError):
-    """The instruction has not arrived; one line: why."""
+    """The instruction was not delivered; the message is one line with the reason."""
 
 
 def say(path: Path, instruction: str, timeout_s: float = ANSWER_S) -> str:
-    """Hand an instruction over and return what was accepted. Raises InstructionError, SayError, OSError."""
+    """Send an instruction and return the accepted text. Raises InstructionError, SayError, OSError."""
     from edge.reasoning.prompt import check_instruction  # loads NumPy and the tokenizer: a stop must not wait for them
 
     with _question(path, check_instruction(instruction)) as asking:
@@ -61,8 +61,8 @@ def say(path: Path, instruction: str, timeout_s: float = ANSWER_S) -> str:
 def stop_robot(path: Path, bridge: Path | None = None) -> int:
     """Stop the robot by the operator's socket of every bridge found and by the runner; returns the exit code.
 
-    `path`: the runner's instruction socket; `bridge`: the only bridge to ask, None for those that `edge-bridge stop`
-    asks and the runner's own.
+    `path`: the runner's instruction socket; `bridge`: socket of the only bridge to stop; None: those that
+    `edge-bridge stop` finds and the runner's own.
     """
     from firmware_bridge.operate import operate
 
@@ -78,7 +78,7 @@ def stop_robot(path: Path, bridge: Path | None = None) -> int:
         answer = None if asking is None else _stop_answer(asking, path)
     runners = None if answer is None else Path(str(answer.get("bridge")))
     if runners is not None and (code != EXIT_DONE or runners not in bridges):
-        # The runner names its bridge: it decides, together with a bridge that the user named.
+        # The runner names its bridge: that bridge's state decides, and that of any bridge which the user named.
         runners_code = operate(STOP, runners)[0]
         code = runners_code if bridge is None else max(code, runners_code)
     if code == EXIT_DONE and (bridge is not None or runners is not None):
@@ -97,7 +97,7 @@ def stop_robot(path: Path, bridge: Path | None = None) -> int:
 
 @contextlib.contextmanager
 def _question(path: Path, instruction: str) -> Iterator[socket.socket]:
-    """A socket over which the runner was asked and can answer. Raises OSError."""
+    """Send to the runner; return the socket that receives its answer. Raises OSError."""
     with tempfile.TemporaryDirectory(prefix="tic-") as own, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as asking:
         asking.bind(str(Path(own) / "a"))
         asking.settimeout(ANSWER_S if instruction != STOP else 0.0)  # a full queue must not delay the operator's stop
@@ -106,7 +106,7 @@ def _question(path: Path, instruction: str) -> Iterator[socket.socket]:
 
 
 def _answer(asking: socket.socket, path: Path, timeout_s: float) -> Any:
-    """What the runner answers. Raises SayError, OSError."""
+    """Return the runner's answer. Raises SayError, OSError."""
     asking.settimeout(timeout_s)
     try:
         return json.loads(asking.recv(65_536))
@@ -117,7 +117,7 @@ def _answer(asking: socket.socket, path: Path, timeout_s: float) -> Any:
 
 
 def _stop_answer(asking: socket.socket, path: Path) -> dict[str, Any] | None:
-    """The runner's answer to a stop phrase; None without one that can be used."""
+    """Return the runner's answer to a stop phrase; None without a valid one."""
     try:
         answer = _answer(asking, path, STOP_ANSWER_S)
     except (SayError, OSError) as error:
@@ -125,12 +125,12 @@ def _stop_answer(asking: socket.socket, path: Path) -> dict[str, Any] | None:
         return None
     if isinstance(answer, dict) and "stopped" in answer and "bridge" in answer:
         return answer
-    sys.stderr.write(f"edge-say: {path}: expected that the runner stops, it answers {answer}\n")
+    sys.stderr.write(f"edge-say: {path}: expected the runner to stop, found the answer {answer}\n")
     return None
 
 
 def _is_absent(bridge: Path) -> bool:
-    """Whether there is certainly no bridge; one that this user cannot see counts as present."""
+    """Return whether no bridge exists; a bridge that this user cannot see counts as present."""
     try:
         Path(f"{bridge}{OPERATOR_SUFFIX}").lstat()
     except (FileNotFoundError, NotADirectoryError):

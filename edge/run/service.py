@@ -1,6 +1,6 @@
-"""The runner as a service (ready, a status line, watchdog, stopping; nothing without systemd), and its lines.
+"""Reports the runner to systemd (ready, status line, watchdog, stopping) and writes its lines for the operator.
 
-Ready is a runner that drives on time, or one that waits for an operator who may take hours.
+The runner is ready once it drives on time, or while it waits for an operator. Without systemd nothing is sent.
 """
 
 from __future__ import annotations
@@ -23,9 +23,8 @@ class ServiceReporter:
     """Thin shell around `WatchdogFeeder` and `Notifier`; every call returns at once and raises nothing.
 
     Order of use: `starting` before each long step of start-up, `on_wait` while the runner waits for an operator and
-    until it drives, `on_tick` from the control thread after every tick, `stopping` once. Ready is said when the control
-    thread has been on time for a whole window or the waiting begins, so what systemd counts as started is a runner that
-    drives, or will do so when an operator permits it.
+    until it drives, `on_tick` from the control thread after every tick, `stopping` once. The runner reports ready when
+    the control thread has been on time for a whole window, or when it begins to wait for an operator.
     """
 
     def __init__(
@@ -36,7 +35,7 @@ class ServiceReporter:
         describe: Callable[[], str],
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`describe()`: the status line's text, short; called in the control thread, so it must not wait."""
+        """`describe()` returns the status line's short text; the control thread calls it, so it must not wait."""
         self._notifier = notifier
         self._feeder = WatchdogFeeder(ping_period_ns=notifier.watchdog_period_ns, tick_period_ns=tick_period_ns)
         self._describe = describe
@@ -47,12 +46,12 @@ class ServiceReporter:
         self._waited = ""
 
     def starting(self, text: str, at_most_s: float) -> None:
-        """Start-up goes on with a step that takes at most this long; more than that and systemd ends the start."""
+        """Announce a start-up step of at most this duration, s; systemd ends a start that takes longer."""
         self._notifier.extend(at_most_s)
         self._notifier.status(text)
 
     def on_wait(self, text: str) -> None:
-        """One turn of the loop that waits to be armed; `text`: what for. Called several times a second."""
+        """Report the reason `text` for waiting; called several times a second."""
         if not self._notifier.enabled:
             return
         now_ns, period_ns = self._clock(), self._notifier.watchdog_period_ns
@@ -61,7 +60,7 @@ class ServiceReporter:
             return
         if text != self._waited and self._notifier.status(text):
             self._waited = text
-        # Twice as often as need be: at the change to driving, the first ticks feed nothing yet.
+        # Ping twice as often as necessary: when driving begins, the first ticks do not ping yet.
         if period_ns is not None and now_ns - self._fed_ns >= period_ns // 2 and self._notifier.watchdog():
             self._fed_ns = now_ns
 
@@ -72,7 +71,7 @@ class ServiceReporter:
         now_ns = self._clock()
         ping = self._feeder.on_tick(on_time, now_ns)
         if not self._ready:
-            # Said until it has been sent: without it systemd would end a runner that drives.
+            # Repeated until it has been sent: without it systemd would end a runner that drives.
             self._ready = self._feeder.healthy and self._notifier.ready(self._describe())
             return
         if ping:
@@ -82,27 +81,27 @@ class ServiceReporter:
             self._notifier.status(self._describe())
 
     def stopping(self, text: str) -> None:
-        """The run ends, by itself, by a fault or on request."""
+        """Report that the run ends."""
         self._notifier.stopping(text)
 
 
 class Descriptor:
-    """What `LineLog` writes to. No buffer, so no lock that a blocked write would keep until the interpreter's end."""
+    """The stream of a `LineLog`. It has no buffer, and so no lock that a blocked write would hold at exit."""
 
     def __init__(self, number: int) -> None:
         self._number = number
 
     def write(self, text: str) -> int:
-        """Write all of it, however long the reader takes; raises OSError."""
+        """Write the whole text, however long the reader takes; raises OSError."""
         data = memoryview(text.encode("utf-8", "backslashreplace"))
         while data:
             data = data[os.write(self._number, data) :]
         return len(text)
 
     def flush(self) -> None:
-        """Nothing is kept back."""
+        """Do nothing: no text is buffered."""
 
 
 def operator_lines(prefix: str, descriptor: int = 2) -> LineLog:
-    """Lines to standard error: a pager that is not read or a pipe that broke delays and ends nothing."""
+    """Return a log to standard error; a blocked or broken pipe neither delays nor ends the run."""
     return LineLog(cast(TextIO, Descriptor(descriptor)), prefix, capacity=CAPACITY)

@@ -36,16 +36,16 @@ from firmware_bridge.core.config import RobotConfig
 from firmware_bridge.notify import Notifier
 
 CAMERA_LEAD = 0.5
-"""Share of a tick period by which a frame is asked for before the tick that uses it."""
+"""Share of a tick period by which a frame is requested before the tick that uses it."""
 READY_TIMEOUT_S = 10.0
 OPEN_S = 60.0
-"""As a service: the most that hashing, opening and warming up a large model's graphs takes."""
+"""Time limit of a service for hashing, opening and warming up a large model's graphs, s."""
 END_S = 7.0
-"""How long everything may take to end, together; systemd kills a service after 10 s (TimeoutStopSec)."""
+"""Time limit of the whole shutdown, s; systemd kills a service after 10 s (TimeoutStopSec)."""
 JOIN_S = 3.0
-"""Of it, the most for both loops' threads: a call of a graph is interrupted."""
+"""Part of it for both loops' threads, s; a call of a graph is interrupted."""
 STOP_CONFIRM_S = 1.0
-"""Of it, the most until the bridge confirms that it has sent zero velocity."""
+"""Part of it for the bridge's confirmation that it has sent zero velocity, s."""
 STANDSTILL_S = 2.0
 """Time for the robot to come to rest and report it, s."""
 STOP_PHRASE = f"{FAULTS['stop-phrase'].message} {FAULTS['stop-phrase'].advice}"
@@ -69,7 +69,7 @@ class RunSession:
         self._robot = robot
         self._options = options
         self._print = say
-        # Threads leave their lines here, the main thread hands them on.
+        # Threads append lines, and the main thread prints them.
         self._lines: deque[str] = deque(maxlen=LINES)
         self._period_ns = runtime.tick_period_ms * 1_000_000
         self._schedule = schedule_for(artifacts)
@@ -98,7 +98,7 @@ class RunSession:
         self._faults: list[str] = []
         self._began = False
         self.hung = False
-        """Whether reasoning hangs in a call that nothing but the end of the process ends."""
+        """Whether reasoning hangs in a call that only the end of the process ends."""
 
     def _open_instructions(self, bridge: BridgeClient) -> InstructionSocket | None:
         if self._options.instructions is None:
@@ -114,7 +114,7 @@ class RunSession:
             raise RefusedError(str(error)) from error
 
     def _stop_by_phrase(self, bridge: BridgeClient) -> bool:
-        """Stop the robot and end the run; whether the bridge reports within STANDSTILL_S that it stands still."""
+        """Stop the robot and end the run; return whether the bridge reports standstill within STANDSTILL_S."""
         bridge.stop()
         if STOP_PHRASE not in self._faults:
             self._faults.append(STOP_PHRASE)
@@ -123,13 +123,13 @@ class RunSession:
         return disarm(bridge, limit_s=STANDSTILL_S)
 
     def _take_instructions(self, channel: InstructionSocket | None, loops: Loops) -> None:
-        """Hand a new instruction on to reasoning; a stop phrase has stopped the robot when this returns."""
+        """Forward a new instruction to reasoning; after a stop phrase the robot has been stopped on return."""
         if channel is not None and (instruction := channel.poll()) is not None:
             loops.reasoning.submit(instruction)
             self._print(f"new instruction: {instruction}")
 
     def request_stop(self) -> None:
-        """Ask for a clean end. Safe in a signal handler: it takes no lock, the main thread polls it."""
+        """Request a clean end. Safe in a signal handler: it takes no lock, and the main thread polls the flag."""
         self._stop_requested = True
 
     def run(self) -> dict[str, Any]:
@@ -221,7 +221,7 @@ class RunSession:
         return result
 
     def _end_by(self, why: str) -> None:
-        """A thread that the run cannot do without has died; any thread."""
+        """End the run because a necessary thread has died; any thread may call it."""
         self._faults.append(why)
         self._finished.set()
 
@@ -233,15 +233,15 @@ class RunSession:
         return f"{supervision.state.value}{faults}, {self._loops.reasoning.cycle.published} generations"
 
     def _await_inputs(self, inputs: RobotInputs, bridge: BridgeClient) -> None:
-        """Until there is a picture and a pose: a robot that an operator arms may be switched on hours later."""
+        """Wait for a frame and a pose; without a time limit where an operator arms the robot."""
         waits = self._robot.safety.operator_arm
-        deadline, said = Deadline(READY_TIMEOUT_S), False
+        deadline, reported = Deadline(READY_TIMEOUT_S), False
         while not inputs.ready:
             if self._stop_requested:
                 raise StoppedEarlyError("stopped before the robot was armed")
             if self._finished.is_set():
                 raise RefusedError(self._faults[0])
-            bridge.poll()  # raises when it has gone
+            bridge.poll()  # raises when the connection has ended
             missing = "state" if inputs.history.newest() is None else "camera frame"
             if deadline.left_s() <= 0 and not waits:
                 why = f" ({inputs.camera.last_error})" if inputs.camera.last_error else ""
@@ -250,13 +250,13 @@ class RunSession:
             if waits:
                 self._reporter.on_wait(f"waiting for the robot: no {missing} yet")
                 self._print_lines()
-                if deadline.left_s() <= 0 and not said:
-                    said = True
+                if deadline.left_s() <= 0 and not reported:
+                    reported = True
                     self._print(f"waiting for the robot: no {missing} yet, is it on?")
             time.sleep(POLL_S)
 
     def _arm(self, bridge: BridgeClient, loops: Loops, channel: InstructionSocket | None) -> int:
-        """Arm, after an operator where the robot file wants one; returns the last sequence number used.
+        """Arm, after an operator where the robot file requires one; return the last sequence number used.
 
         Raises RefusedError after a stop phrase, StoppedEarlyError after another request to stop.
         """
@@ -289,7 +289,7 @@ class RunSession:
     def _drive(
         self, loops: Loops, inputs: RobotInputs, bridge: BridgeClient, channel: InstructionSocket | None
     ) -> Deadline:
-        """Run both threads until the end; this thread only waits and watches. Returns by when all must have ended."""
+        """Run both threads to their end while this thread watches them; return the deadline of the shutdown."""
         # The bridge's deadman is already running: the first command must not wait for a whole period.
         epoch_ns = time.monotonic_ns() + self._period_ns // 2
         inputs.camera.align(epoch_ns - round(CAMERA_LEAD * self._period_ns))
@@ -304,11 +304,11 @@ class RunSession:
                 self._faults.append(f"the {control.ended_by} ended the run: {ended}")
 
         def stop_robot() -> None:
-            # At once, not after the reasoning thread has been waited for.
+            # Before the wait for the reasoning thread.
             bridge.stop()
             self._reporter.stopping(self._faults[0] if self._faults else "the run has ended")
 
-        # Daemons: a thread that hangs in a driver must not keep the process from ending.
+        # Daemon threads: one that hangs in a driver must not keep the process alive.
         threads = [
             threading.Thread(target=self._guard("control", drive, stop_robot), name="control", daemon=True),
             threading.Thread(target=self._guard("reasoning", reasoning.run), name="reasoning", daemon=True),
@@ -329,14 +329,14 @@ class RunSession:
     def _guard(
         self, name: str, body: Callable[[], None], after: Callable[[], None] | None = None
     ) -> Callable[[], None]:
-        """The body of a thread whose end is the end of the run; `after` is called when the faults are known."""
+        """Run a thread's body; its end ends the run. `after` is called once its faults are recorded."""
 
         def target() -> None:
             try:
                 body()
             except BridgeUnavailable as error:
                 self._faults.append(f"bridge lost: {error}")
-            except Exception as error:  # noqa: BLE001 - a dead thread must end the run, whatever killed it
+            except Exception as error:  # noqa: BLE001 - a dead thread must end the run, whatever the error
                 self._faults.append(f"{name} thread died: {type(error).__name__}: {error}")
             finally:
                 if after is not None:
@@ -346,14 +346,14 @@ class RunSession:
         return target
 
     def _watch_run(self, loops: Loops, inputs: RobotInputs, channel: InstructionSocket | None) -> None:
-        """Until a thread has ended or a stop is asked for: hand on lines and instructions, watch over reasoning."""
-        reasoning, says, watch = loops.reasoning, "", ReasoningWatch()
+        """Forward lines and instructions and watch reasoning until a thread has ended or a stop is requested."""
+        reasoning, message, watch = loops.reasoning, "", ReasoningWatch()
         while not self._finished.wait(POLL_S):
             if self._stop_requested:
                 self._stop.set()
-            if loops.control.supervision.message != says:
-                says = loops.control.supervision.message
-                self._print(says or "all faults have cleared")
+            if loops.control.supervision.message != message:
+                message = loops.control.supervision.message
+                self._print(message or "all faults have cleared")
             self._print_lines()
             self._take_instructions(channel, loops)
             hang = watch.step(
@@ -367,7 +367,7 @@ class RunSession:
                 inputs.findings.put((Finding("reasoning-hung", f"for {watch.hung_s:.0f} s"),))
 
     def _halt(self, bridge: BridgeClient, end: Deadline) -> BridgeStatus | None:
-        """Wait until the bridge has put zero on the wire (it does so in any case, within its deadman)."""
+        """Wait until the bridge confirms zero velocity; it sends zero in any case within its deadman time."""
         status: BridgeStatus | None = None
         try:
             confirm = Deadline(end.left_s(STOP_CONFIRM_S))
@@ -385,7 +385,7 @@ class RunSession:
     def _close_recorder(self, recorder: Recorder, result: dict[str, Any] | None, end: Deadline) -> None:
         recorder.close(end.left_s())
         if not self._began:
-            recorder.path.unlink(missing_ok=True)  # an empty log would only mislead
+            recorder.path.unlink(missing_ok=True)  # an empty log would mislead
             return
         dropped = sum(recorder.dropped.values())
         if result is not None:

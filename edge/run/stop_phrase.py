@@ -10,11 +10,11 @@ from typing import Final
 
 STOP_WORDS: Final = frozenset({"stop", "halt", "freeze", "estop"})
 COMPANIONS: Final = frozenset({"now", "right", "immediately", "please", "emergency", "robot", "the", "moving", "e"})
-"""Words that leave a stop phrase a stop phrase ("e" for "e-stop"); with any other word it is an instruction."""
+"""Words that a stop phrase may also contain ("e" for "e-stop"); any other word makes it an instruction."""
 
 
 def is_stop_phrase(text: str) -> bool:
-    """Whether the whole utterance is a stop word, alone or repeated, with nothing but companions beside it.
+    """Return whether the whole utterance is a stop word, alone or repeated, beside companion words only.
 
     Case, punctuation, whitespace, invisible characters and typographic forms of letters do not matter.
     """

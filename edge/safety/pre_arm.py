@@ -1,4 +1,4 @@
-"""Before arming: is everything there that driving needs? The same monitors and table as while driving."""
+"""Checks all inputs before arming with the same monitors and fault table as while driving."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from edge.state.frame import Frame
 from edge.state.pose_history import StampedPose
 
 STOPPED_NS: Final = 2_000_000_000
-"""A fault that would end a run blocks arming until it has not been found for this long."""
+"""Time for which a fault that would end a run must be absent before arming, ns."""
 
 
 class PreArm:
@@ -25,7 +25,7 @@ class PreArm:
         pose: Callable[[], StampedPose | None],
         clock: Callable[[], int],
     ) -> None:
-        """`watch`: one of its own, since a run begins with fresh monitors."""
+        """`watch`: not shared with the run, which begins with fresh monitors."""
         self._watch = watch
         self._picture = picture
         self._pose = pose
@@ -36,12 +36,12 @@ class PreArm:
         self.state = State.STARTING
 
     def blocking_fault(self) -> str:
-        """The worst fault that would keep the robot from moving, for the operator; empty: none."""
+        """Return the worst fault that would keep the robot from moving, for the operator; empty: none."""
         now_ns = self._clock()
         findings = self._watch.standing(self._picture(), self._pose(), now_ns)
         outputs = self._supervisor.step(SupervisorInputs(findings, armed=False), now_ns)
         if outputs.stop:
-            # Nothing is armed, so nothing latches: start over.
+            # The robot is not armed, so nothing latches: start over.
             self._supervisor, self._stopped_ns, self._stopped = Supervisor(), now_ns, outputs.message
         elif self._stopped_ns is not None and now_ns - self._stopped_ns >= STOPPED_NS:
             self._stopped_ns = None

@@ -1,12 +1,12 @@
-"""From findings to what the robot may do: full speed, less, none, or none until it is armed again.
+"""Turns findings into a share of the speed limit, zero velocity, or a latched stop.
 
 `Supervisor.step(inputs, now_ns)` has no clock, thread or I/O. States:
-* starting: something that driving needs is not there yet.
-* ready: everything is there, the robot is not armed.
-* running: armed, nothing found.
+* starting: an input that driving needs is missing.
+* ready: all inputs are present, the robot is not armed.
+* running: armed, no fault.
 * degraded: armed, with at least one fault: a lower speed limit, or zero velocity until it has cleared.
 * stopped: latched. A supervisor never leaves it: a new arming starts with a new supervisor and fresh inputs.
-It can only lower the speed: its output is a share of the limit, 1 at most, and nothing it is given can raise a limit.
+It can only lower the speed: its output is a share of the limit, at most 1, and no input can raise a limit.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _NS_PER_MS = 1_000_000
 
 
 class State(Enum):
-    """What the runner is doing, in one word."""
+    """State of the runner."""
 
     STARTING = "STARTING"
     READY = "READY"
@@ -33,7 +33,7 @@ class State(Enum):
 
 @dataclass(frozen=True)
 class SupervisorInputs:
-    """What was found in this step, and whether the robot is armed."""
+    """The findings of one step, and whether the robot is armed."""
 
     findings: tuple[Finding, ...]
     armed: bool
@@ -51,17 +51,17 @@ class FaultEvent:
 
 @dataclass(frozen=True)
 class SupervisorOutputs:
-    """What the robot may do now, and the line for the operator."""
+    """The permitted speed, and the line for the operator."""
 
     state: State
     speed_scale: float
     """Share of the speed limit, 0..1; 0 is zero velocity in this very step."""
     stop: bool
-    """The run is over: stop the robot and take it down."""
+    """The run is over: stop the robot and end the run."""
     active: tuple[str, ...]
-    """Names of the faults that are there now, the worst first."""
+    """Names of the active faults, the worst first."""
     events: tuple[FaultEvent, ...]
-    """What began and ended in this step."""
+    """Faults that began or ended in this step."""
     message: str
     """One line for the operator: the worst fault and what to do next; empty while there is none."""
 
@@ -78,7 +78,7 @@ _ORDER = (Action.STOP, Action.ZERO, Action.LIMIT, Action.NOTHING)
 
 
 class Supervisor:
-    """Keeps the active faults, at most one entry each, and the instants of those that count."""
+    """State machine with the active faults, at most one entry each, and the instants that escalations count."""
 
     def __init__(self) -> None:
         self._active: dict[str, _Active] = {}
@@ -89,7 +89,7 @@ class Supervisor:
         self._ordered: tuple[_Active, ...] = ()
 
     def step(self, inputs: SupervisorInputs, now_ns: int) -> SupervisorOutputs:
-        """Take this step's findings; what is not found for its clear time ends, what is latched stays."""
+        """Take this step's findings. A fault ends once it is absent for its clear time; a latched one stays."""
         events: list[FaultEvent] = []
         for finding in inputs.findings:
             self._found(finding, now_ns, events)
@@ -128,7 +128,7 @@ class Supervisor:
             events.append(FaultEvent(now_ns, fault, True, finding.detail))
             self._stopped = self._stopped or fault.latch
         else:
-            # The detail stays that of the beginning: the operator reads one line for a fault, not one a tick.
+            # Keep the first detail: the operator reads one line a fault, not one a tick.
             entry.speed_scale, entry.seen_ns = scale, now_ns
         if fault.escalation is not None:
             instants = self._instants[fault.name]

@@ -1,7 +1,7 @@
-"""Whether the runner's threads still make progress: when to feed systemd's watchdog, when to give up on reasoning.
+"""Decides from the threads' progress when to ping systemd's watchdog and when to restart because of reasoning.
 
-A process whose control thread is late, hung or dead must not be kept alive by another thread. Nothing can end a
-reasoning thread that hangs in a driver: after an interrupt without effect only a new process helps.
+No other thread may keep a process alive whose control thread is late, hung or dead. A reasoning thread that hangs in a
+driver cannot be ended: after an interrupt without effect only a new process helps.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from typing import Final
 
 WINDOW_TICKS: Final = 10
 NEEDED_ON_TIME: Final = 8
-"""Of the last WINDOW_TICKS; one or two late ticks are the bridge's business (its deadman), not a reason to restart."""
+"""Required ticks on time of the last WINDOW_TICKS; one or two late ticks are left to the bridge's deadman."""
 CALL_MS: Final = 10_000.0
-"""Time that every call may take."""
+"""Shortest time limit of a call, ms."""
 GENERATIONS: Final = 3.0
 """Multiple of the longest generation so far that a call may take: a single call is a part of one."""
 GIVE_UP_NS: Final = 20_000_000_000
-"""After the interrupt. Fault matrix row 17 wants reasoning back within 30 s; the robot stands by then (its age)."""
+"""Time limit after the interrupt: fault matrix row 17 requires reasoning within 30 s. The robot stands meanwhile."""
 MAX_STEP_NS: Final = 1_000_000_000
-"""The most that one step counts: a process that was frozen has not hung."""
+"""Largest duration that one step counts: a process that was frozen has not hung."""
 
 
 class WatchdogFeeder:
@@ -38,11 +38,11 @@ class WatchdogFeeder:
 
     @property
     def healthy(self) -> bool:
-        """Enough of the newest ticks were on time; False until there have been enough of them."""
+        """Whether enough of the newest ticks were on time; False during the first WINDOW_TICKS."""
         return len(self._recent) == WINDOW_TICKS and sum(self._recent) >= NEEDED_ON_TIME
 
     def on_tick(self, on_time: bool, now_ns: int) -> bool:
-        """Whether to ping now. Deadlines that were slept over since the last tick count as ticks that were late."""
+        """Return whether to ping now. Missed deadlines since the last tick count as late ticks."""
         if self._ticked_ns is not None:
             passed = (now_ns - self._ticked_ns + self._tick_period_ns // 2) // self._tick_period_ns
             self._recent.extend([False] * min(max(0, passed - 1), WINDOW_TICKS))
@@ -57,11 +57,11 @@ class WatchdogFeeder:
 
 
 class Hang(Enum):
-    """What to do about a call that hangs."""
+    """Action for a call that hangs."""
 
     NONE = "none"
     INTERRUPT = "interrupt"
-    """Once for each hang."""
+    """Issued once a hang."""
     GIVE_UP = "give up"
 
 
@@ -90,5 +90,5 @@ class ReasoningWatch:
 
     @property
     def hung_s(self) -> float:
-        """For how long there has been no progress."""
+        """Duration without progress, s."""
         return self._hung_ns / 1e9

@@ -1,2 +1,1 @@
-"""What the threads of a run share: camera frames, encoded frames, pose history, the semantic state, the reasoning
-text."""
+"""Data shared by a run's threads: frames, encoded frames, pose history, semantic state, reasoning text."""

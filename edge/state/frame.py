@@ -1,4 +1,4 @@
-"""A camera picture in the form that the vision encoder takes."""
+"""Camera frames in the vision encoder's input format."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 @dataclass(frozen=True)
 class Frame:
-    """One camera picture ready for the encoder, with its capture stamp and the JPEG it came from."""
+    """One frame in the encoder's format, with its capture stamp and source JPEG."""
 
     stamp_ns: int
     pixels: npt.NDArray[np.uint8]
@@ -21,7 +21,7 @@ class Frame:
 
 
 def fit_frame(rgb: npt.NDArray[np.uint8], image_px: int) -> npt.NDArray[np.uint8]:
-    """Camera image [h, w, 3] → the encoder's [1, px, px, 3]; the whole field of view, as InternVL's single tile."""
+    """Resize a camera image [h, w, 3] to [1, px, px, 3]: the whole field of view, as InternVL's single tile."""
     if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
         raise ValueError(f"expected a uint8 image [h, w, 3], found {rgb.dtype}{list(rgb.shape)}")
     shrinks = rgb.shape[0] > image_px

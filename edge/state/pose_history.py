@@ -1,4 +1,4 @@
-"""Pose history of the robot, as the drift estimator gives it: read by two threads, written by a third, no lock."""
+"""Pose history of the drift estimator, without a lock: one thread writes, two threads read."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from edge.core.geometry import SE2, interpolate
 
 @dataclass(frozen=True)
 class StampedPose:
-    """One fused pose: monotonic stamp, `T_odom_base`, body velocity; the attitude that the robot reported with it."""
+    """One fused pose: monotonic stamp, `T_odom_base`, body velocity, and the robot's reported attitude."""
 
     stamp_ns: int
     T_odom_base: SE2
@@ -39,11 +39,11 @@ class PoseHistory:
         self._count += 1
 
     def newest(self) -> StampedPose | None:
-        """The last pose put, or None."""
+        """Return the newest pose; None while the history is empty."""
         return self._slots[(self._count - 1) % len(self._slots)] if self._count else None
 
     def at(self, stamp_ns: int) -> SE2 | None:
-        """`T_odom_base` at an instant, interpolated; the nearest end outside the history; None while it is empty."""
+        """Return `T_odom_base` at an instant, interpolated; outside the history its nearest end; None while empty."""
         around = self._around(stamp_ns)
         if around is None:
             return None
@@ -51,7 +51,7 @@ class PoseHistory:
         return interpolate(before.T_odom_base, after.T_odom_base, fraction)
 
     def attitude_at(self, stamp_ns: int) -> tuple[float, float] | None:
-        """Roll and pitch, rad, at an instant, found like `at` finds the pose."""
+        """Return roll and pitch, rad, at an instant, interpolated like the pose in `at`."""
         around = self._around(stamp_ns)
         if around is None:
             return None
@@ -62,15 +62,15 @@ class PoseHistory:
         )
 
     def _around(self, stamp_ns: int) -> tuple[StampedPose, StampedPose, float] | None:
-        """The poses before and after an instant, and where it lies between them, 0..1."""
+        """Return the poses before and after an instant, and its fraction of the way between them, 0..1."""
         count = self._count
         slots = list(self._slots)
         after: StampedPose | None = None
-        # Backwards from the newest: what is asked for is nearly always a fraction of a second old.
+        # Search backwards from the newest: nearly every request is a fraction of a second old.
         for index in range(count - 1, max(count - len(slots), 0) - 1, -1):
             before = slots[index % len(slots)]
             if before is None or (after is not None and before.stamp_ns >= after.stamp_ns):
-                break  # the writer has overtaken this end of the copy
+                break  # the writer has overwritten this end of the copy
             if before.stamp_ns <= stamp_ns:
                 if after is None:
                     return before, before, 0.0

@@ -13,7 +13,7 @@ from edge.core.geometry import SE2
 Floats = npt.NDArray[np.float32]
 
 TOLERANCE_S = 0.5
-"""How far a frame may be from the instant that was asked for."""
+"""Largest distance of a frame's stamp from the requested instant, ns."""
 
 
 @dataclass(frozen=True)
@@ -29,24 +29,24 @@ class TokenRing:
     """The last `capacity` frames; lock-free for one writer (see `PoseHistory` for why that is sound).
 
     With a `shape`, the tokens of every slot have a buffer that is allocated once: the writer encodes into
-    `next_buffer()` and puts a frame with these tokens. Readers are given copies, and never of a slot that was
-    overwritten meanwhile.
+    `next_buffer()` and puts a frame with these tokens. Readers receive copies, never of a slot that was overwritten
+    meanwhile.
     """
 
     def __init__(self, capacity: int, shape: Sequence[int] | None = None) -> None:
         if capacity < 2:
             raise ValueError(f"a token ring needs 2 slots or more, found {capacity}")
         self._slots: list[EncodedFrame | None] = [None] * capacity
-        # Filled, so that no tick is the first to touch a page.
+        # Filled, so that no tick causes the first page fault.
         self._buffers = None if shape is None else [np.full(shape, 0, dtype=np.float32) for _ in range(capacity)]
         self._count = 0
 
     def next_buffer(self) -> Floats | None:
-        """Where the next frame's tokens go (the oldest frame's, which is forgotten now); None without buffers."""
+        """Drop the oldest frame and return its buffer for the next frame's tokens; None without buffers."""
         if self._buffers is None:
             return None
         index = self._count % len(self._slots)
-        # Before the first write: a reader that is copying sees afterwards that the frame has gone.
+        # Before the first write: a reader that is copying finds afterwards that the frame was dropped.
         self._slots[index] = None
         return self._buffers[index]
 
@@ -57,18 +57,18 @@ class TokenRing:
 
     @property
     def newest_ns(self) -> int | None:
-        """Capture stamp of the newest frame, None while there is none."""
+        """Return the capture stamp of the newest frame, ns; None while there is none."""
         return max((frame.stamp_ns for frame in list(self._slots) if frame is not None), default=None)
 
     def newest(self, count: int) -> list[tuple[int, SE2]]:
-        """Capture stamp and pose of the newest frames that there are, at most `count`, oldest first."""
+        """Return stamp and pose of at most `count` of the newest frames, oldest first."""
         frames = [frame for frame in list(self._slots) if frame is not None]
         return [(frame.stamp_ns, frame.T_odom_base) for frame in sorted(frames, key=lambda frame: frame.stamp_ns)][
             -count:
         ]
 
     def nearest(self, stamp_ns: int, tolerance_s: float = TOLERANCE_S) -> EncodedFrame | None:
-        """The frame captured nearest to an instant, its tokens a reader's own; None if none is near enough."""
+        """Return the frame captured nearest to an instant, with a copy of its tokens; None if none is near enough."""
         frames = [frame for frame in list(self._slots) if frame is not None]
         nearest = min(frames, key=lambda frame: abs(frame.stamp_ns - stamp_ns), default=None)
         if nearest is None or abs(nearest.stamp_ns - stamp_ns) > tolerance_s * 1e9:

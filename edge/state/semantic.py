@@ -1,4 +1,4 @@
-"""The semantic state: what the control thread knows of the last released generation."""
+"""The semantic state: the last released generation, as the control thread reads it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from edge.state.reasoning_text import WAYPOINT_TIMES_S, Waypoints, plans_to_wait
 from edge.state.ring import TokenRing
 
 STRAIGHT_AHEAD: Waypoints = tuple((time_s / 2, 0.0) for time_s in WAYPOINT_TIMES_S)
-"""Waypoints at 0.5 m/s: what graphs are warmed up and timed with."""
+"""Waypoints at 0.5 m/s, with which graphs are warmed up and timed."""
 
 Context = Mapping[str, npt.NDArray[np.generic]]
 """The semantic context by tensor name: `context.0.key` [1, heads, d, T], `context.0.value` [1, heads, T, d], …"""
@@ -47,7 +47,7 @@ class SemanticState:
     text: str
     waypoints: Waypoints | None
     text_complete: bool = True
-    """False: the mode or the power budget cut the text short, so that it is no sign of the model's health."""
+    """False: the mode or the power budget cut the text short, so an invalid text is no model fault."""
     T_odom_stop: SE2 | None = None
     """Where this text and those before it plan to stop (`edge.reasoning.instruction_state`)."""
 
@@ -65,7 +65,7 @@ class SemanticState:
         return self.T_odom_anchor.inverse() @ T_odom_base
 
     def latency_input(self, now_ns: int, T_odom_base: SE2, trained_delay_s: float) -> LatencyInput:
-        """Δt limited to 0 to `trained_delay_s`, the largest that the policy was trained for, and the motion offset."""
+        """Return the motion offset and Δt clamped to 0..`trained_delay_s`, the largest in the policy's training."""
         delay_s = min(max(self.delay_s(now_ns), 0.0), trained_delay_s)
         return LatencyInput(delay_s, self.motion_offset(T_odom_base))
 
@@ -82,17 +82,17 @@ def waypoints_now(waypoints: Waypoints, offset: SE2) -> npt.NDArray[np.float32]:
 
 
 class SemanticSlot:
-    """Where the reasoning thread leaves its newest result; reading and replacing a field are single operations."""
+    """The slot of the reasoning thread's newest result; reading and replacing a field are single operations."""
 
     def __init__(self) -> None:
         self.state: SemanticState | None = None
         self.drive_until_ns: int | None = None
-        """Until when there may be driving; None: no such limit."""
+        """End of the time in which the robot may drive, ns; None: no such end."""
 
 
 @dataclass(frozen=True)
 class SharedState:
-    """What the two loops exchange: encoded frames to the reasoning, the semantic state to the control loop."""
+    """The data that the two loops exchange: encoded frames to reasoning, the semantic state to control."""
 
     ring: TokenRing
     slot: SemanticSlot

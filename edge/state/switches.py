@@ -1,7 +1,7 @@
-"""The switches of what this project adds to the paper's method: the decoding rules and the recoveries.
+"""Switches of this project's additions to the paper's method: the decoding rules and the recoveries.
 
 A manifest's `runtime` section has a default of each; `edge-run` and `edge-bench` have an option of each that overrides
-it; results and flight logs say which was in force.
+it; results and flight logs record the values in force.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ class RecoverySwitch(Enum):
 
 @dataclass(frozen=True)
 class Switches:
-    """What is in force in one run."""
+    """The values in force in one run."""
 
     decoding: Decoding = Decoding.CONSTRAINED
     recovery: RecoverySwitch = RecoverySwitch.ON
     stand_at_goal: bool = True
-    """Whether the robot stands where its texts have placed the stop: one of the recoveries."""
+    """Whether the robot stands at the stop that its texts have placed; one of the recoveries."""
 
     def __post_init__(self) -> None:
         if self.stand_at_goal and self.recovery is RecoverySwitch.OFF:
@@ -49,7 +49,7 @@ class Switches:
 
 @dataclass(frozen=True)
 class SwitchOptions:
-    """What a command line asks for; None: the manifest's default, and the command's own for standing at the goal."""
+    """Switches of a command line; None: the manifest's default, and the command's own for standing at the goal."""
 
     decoding: Decoding | None = None
     recovery: RecoverySwitch | None = None
@@ -67,7 +67,7 @@ class SwitchOptions:
         return options
 
     def over(self, decoding: Decoding, recovery: RecoverySwitch, *, stand_at_goal: bool) -> Switches:
-        """Return what is in force over these defaults; without recovery the robot stands at no goal by default.
+        """Return the values in force over these defaults; without recovery the robot stands at no goal by default.
 
         Raises ValueError when the options ask for standing at the goal without recovery.
         """

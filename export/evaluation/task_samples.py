@@ -14,7 +14,7 @@ import numpy.typing as npt
 from tokenizers import Tokenizer
 
 from edge.core.geometry import SE2, interpolate
-from edge.reasoning.path_memory import way_of
+from edge.reasoning.path_memory import past_path_of
 from edge.reasoning.prompt import PromptBuilder, PromptIds
 from edge.state.frame import fit_frame
 from edge.state.reasoning_text import WAYPOINT_TIMES_S
@@ -127,7 +127,7 @@ def samples_from(
                 for i in indices
             ]
             # The builder gives one segment a frame, then the tail: the frames' places follow from the order.
-            way = way_of((frame.stamp_ns, frame.T_odom_base) for frame in clip.frames[: indices[-1] + 1])
+            way = past_path_of((frame.stamp_ns, frame.T_odom_base) for frame in clip.frames[: indices[-1] + 1])
             segments = builder.build(encoded, clip.instruction, way)
             places = [index_of(number, i) for i in indices]
             prompt = tuple(

@@ -1,1 +1,1 @@
-"""The bridge's rules and what they work on, without a clock, a socket or DDS."""
+"""The bridge's rules, configuration and messages, without a clock, a socket or DDS."""

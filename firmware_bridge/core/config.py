@@ -1,7 +1,7 @@
 """Robot description files (`firmware_bridge/robots/*.toml`): read, checked key by key, frozen.
 
-Everything that differs between the simulated robot and a real one is in such a file, and between `go2_sim.toml`
-and `go2.toml` only the `[dds]` addresses differ.
+Such a file contains every difference between the simulated robot and a real one. Between `go2_sim.toml` and `go2.toml`
+only the `[dds]` addresses differ.
 """
 
 from __future__ import annotations
@@ -52,18 +52,18 @@ def _require(condition: bool, message: str) -> None:
 
 
 def _speed_hint(key: str, value: float) -> str:
-    """The end of a complaint about a speed that is too high: what the value is if it was given in km/h."""
+    """Return the end of a message about a speed that is too high: the value converted from km/h."""
     return f"; if it is in km/h, write {value / 3.6:.2f}" if key.endswith("_mps") and abs(value) > 2 else ""
 
 
 def _within(low: float, high: float, default: Any = MISSING, *, above: bool = False) -> Any:
-    """A field whose value lies in low..high; `above`: low itself is not allowed."""
+    """Declare a field with values in low..high; `above`: low itself is excluded."""
     return field(default=default, metadata={"range": (low, high, above)})
 
 
 @dataclass(frozen=True)
 class _Section:
-    """A table of the robot file, named like its class; checks the fields made by `_within`."""
+    """A table of the robot file, named like its class; it checks the fields declared by `_within`."""
 
     def __post_init__(self) -> None:
         for each in (each for each in fields(self) if "range" in each.metadata):
@@ -75,7 +75,7 @@ class _Section:
 
 @dataclass(frozen=True)
 class DdsConfig(_Section):
-    """Where the robot is: DDS domain, our network interface, and unicast peers for links without multicast."""
+    """Network of the robot: DDS domain, our interface, and unicast peers for links without multicast."""
 
     domain: int
     interface: str
@@ -90,7 +90,7 @@ class DdsConfig(_Section):
 
 @dataclass(frozen=True)
 class BridgeConfig(_Section):
-    """Timing of the deadman process; a relative socket path lies in the user's runtime directory."""
+    """Timing of the bridge; a relative socket path is in the user's runtime directory."""
 
     socket: Path
     rate_hz: int = _within(10, 200, 50)
@@ -109,14 +109,14 @@ class BridgeConfig(_Section):
 
 @dataclass(frozen=True)
 class SafetyConfig(_Section):
-    """What forbids motion besides the bridge's own rules.
+    """Conditions that forbid motion besides the bridge's own rules.
 
-    `sport_version`: what the robot's sport service must answer when asked for its version. `estop_file`: a file that
-    reads 0 while the local emergency stop is released (a GPIO value in sysfs); anything else, or no file, is pressed.
-    `remote_deadband`: share of a stick's travel that is not yet a hand on it. `operator_arm`: every arming needs an
+    `sport_version`: version that the robot's sport service must report. `estop_file`: a file that reads 0 while the
+    local emergency stop is released (a GPIO value in sysfs); any other content, or no file, counts as pressed.
+    `remote_deadband`: share of a stick's travel that does not count as use. `operator_arm`: every arming needs an
     operator's `edge-bridge arm` before it. `above_walking_speed`: permits limits above those that FASTEST has for
-    people nearby. `robot_lowcmd_publishers`: how many publishers of rt/lowcmd belong to the robot itself; one more is
-    a second commander.
+    people nearby. `robot_lowcmd_publishers`: number of the robot's own publishers of rt/lowcmd; one more is a second
+    commander.
     """
 
     sport_version: str = "1.0.0.1"
@@ -153,7 +153,7 @@ class LimitsConfig(_Section):
 
 @dataclass(frozen=True)
 class CameraConfig(_Section):
-    """Front camera: how often to ask, how old a frame is when its answer arrives, how long to wait for one."""
+    """Front camera: request rate, age of a frame when its answer arrives, timeout of a request."""
 
     rate_hz: float = _within(0, 60, above=True)
     latency_ms: float = _within(0, 2000)
@@ -162,8 +162,8 @@ class CameraConfig(_Section):
 
 @dataclass(frozen=True)
 class MountConfig(_Section):
-    """How the front camera is mounted: horizontal field of view, lens above the floor and ahead of the base while the
-    robot stands, and its pitch downwards. Visual odometry needs it.
+    """Mount of the front camera: horizontal field of view, lens height above the floor and distance ahead of the base
+    while the robot stands, and pitch downwards. Visual odometry needs it.
     """
 
     hfov_deg: float = _within(20, 160)
@@ -174,9 +174,9 @@ class MountConfig(_Section):
 
 @dataclass(frozen=True)
 class OdometryConfig(_Section):
-    """Frame of the robot's velocity report, and the age from which its pose is too old to drive by.
+    """Frame of the robot's velocity report, and the age from which its pose is too old for driving.
 
-    `calibration`: absolute path of what `edge-calib odometry` has written for this robot.
+    `calibration`: absolute path of this robot's output of `edge-calib odometry`.
     """
 
     velocity_frame: str
@@ -225,7 +225,7 @@ _SECTIONS: Final = {kind.__name__.removesuffix("Config").lower(): kind for kind 
 
 
 def runtime_dir() -> Path:
-    """Directory for this user's sockets: `$XDG_RUNTIME_DIR/tic-vla-edge`, else one under /tmp named by user id."""
+    """Return the directory of this user's sockets: `$XDG_RUNTIME_DIR/tic-vla-edge`, else one in /tmp by user id."""
     base = os.environ.get("XDG_RUNTIME_DIR", "")
     return Path(base) / "tic-vla-edge" if base else Path("/tmp") / f"tic-vla-edge-{os.getuid()}"
 
@@ -246,14 +246,14 @@ def load_robot_config(path: Path | str, *, socket: Path | None = None, domain: i
 
 
 def _build(cls: Any, table: object, prefix: str) -> Any:
-    """Dataclass `cls` from a TOML table, every key known, of the declared type and finite."""
+    """Build dataclass `cls` from a TOML table; every key must exist, have the declared type and be finite."""
     if not isinstance(table, dict):
         raise ConfigError(f"[{prefix[:-1]}]: expected a table, found {table!r}")
-    known = {each.name: each for each in fields(cls)}
+    declared = {each.name: each for each in fields(cls)}
     for key in table:
-        _require(key in known, f"unknown key {prefix}{key}; expected {', '.join(known)}")
+        _require(key in declared, f"unknown key {prefix}{key}; expected {', '.join(declared)}")
     values: dict[str, Any] = {}
-    for key, each in known.items():
+    for key, each in declared.items():
         if key not in table:
             _require(each.default is not MISSING, f"missing key {prefix}{key}")
         elif cls is RobotConfig and key in _SECTIONS:

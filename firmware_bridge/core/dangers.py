@@ -1,4 +1,4 @@
-"""What forbids motion: the newest reports, and the reason against arming or driving. Pure: no clock, no I/O."""
+"""Derives from the newest reports the reason against arming or driving. Pure: no clock, no I/O."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ _STILL_MPS: Final = 0.05  # fault matrix row 38: stopped means slower than this 
 _STILL_RADPS: Final = 0.2  # our choice: well above what a standing robot's gyroscope shows
 _STILL_NS: Final = 500_000_000
 _CONFIRM_NS: Final = 200_000_000
-"""A robot counts as still after this long without a report of motion: one report can be a change of direction."""
+"""Time without a report of motion after which a robot counts as still: one report can be a change of direction."""
 _SEEN_NS: Final = 200_000_000  # a report older than this proves nothing about motion
 _TILT_RAD: Final = math.radians(30.0)  # fault matrix row 64
-REMOTE_NS: Final = _NS_PER_S  # our choice: a remote counts as in use for this long after its last stick or key
+REMOTE_NS: Final = _NS_PER_S  # our choice: a remote counts as in use for this long after its last input
 _COMMANDER_NS: Final = 2 * _NS_PER_S  # twice as long as a Go2 holds a Move
 _BATTERY_NS: Final = 10 * _NS_PER_S  # our choice: ten of the bridge's own battery reads
 
 Reason = tuple[str, str]
-"""A cause (of link.CAUSES) and a sentence for the operator."""
+"""Pair of a cause (of link.CAUSES) and a sentence for the operator."""
 NO_STATE: Final = ("state_silent", "the robot reports no state")
 NO_BATTERY: Final = ("battery_low", "no battery report")
 
@@ -45,7 +45,7 @@ class DangerWatch:
         self._remote_ns = self._remote_estop_ns = self._moving_ns = _NEVER_NS
 
     def note(self, inputs: Inputs, now_ns: int) -> None:
-        """Remember what this step has brought."""
+        """Take the report of one step."""
         report = inputs.robot
         if report.state is not None:
             self.robot, self.first_report_ns = report.state, self.first_report_ns or now_ns
@@ -62,7 +62,7 @@ class DangerWatch:
         self._publishers, self._writes_fail, self._estop = report.publishers, report.writes_fail, inputs.estop
 
     def danger(self, now_ns: int) -> Reason | None:
-        """What forbids motion in every state, apart from a latched emergency stop."""
+        """Return what forbids motion in every state, apart from a latched emergency stop."""
         robot = self.fresh(now_ns, self._state_timeout_ns)
         if self._estop:
             return "estop", "emergency stop pressed at the local input"
@@ -84,7 +84,7 @@ class DangerWatch:
         return None
 
     def obstacle(self, now_ns: int) -> Reason | None:
-        """What else forbids arming, once nothing is dangerous."""
+        """Return what else forbids arming once nothing forbids motion."""
         percent, least, wanted = self._battery_percent, self._safety.battery_min_percent, self._safety.sport_version
         if self.fresh(now_ns, self._state_timeout_ns) is None:
             return NO_STATE
@@ -97,15 +97,15 @@ class DangerWatch:
         return None
 
     def fresh(self, now_ns: int, timeout_ns: int) -> RobotState | None:
-        """The robot's newest report if it is not older than this."""
+        """Return the robot's newest report if it is not older than this."""
         return None if self.robot is None or now_ns - self.robot.received_ns > timeout_ns else self.robot
 
     def moved_lately(self, now_ns: int) -> bool:
-        """Whether the robot has reported motion within the last half second."""
+        """Return whether the robot has reported motion within the last half second."""
         return now_ns - self._moving_ns < _STILL_NS
 
     def motion(self, now_ns: int, since_ns: int = _NEVER_NS) -> tuple[str, float]:
-        """One of link.MOTIONS and the robot's speed in m/s (-1: unknown).
+        """Return one of link.MOTIONS and the robot's speed in m/s (-1: unknown).
 
         "still" needs a report that is fresh, was received after `since_ns`, comes from the only publisher, and follows
         200 ms without a report of motion.
@@ -119,10 +119,10 @@ class DangerWatch:
 
 
 def is_moving(robot: RobotState) -> bool:
-    """Whether a report shows a robot that walks or turns."""
+    """Return whether a report shows a robot that walks or turns."""
     return math.hypot(robot.vx_mps, robot.vy_mps) >= _STILL_MPS or abs(robot.wz_radps) >= _STILL_RADPS
 
 
 def is_walking(robot: RobotState) -> bool:
-    """Whether a report shows motion or the locomotion mode."""
+    """Return whether a report shows motion or the locomotion mode."""
     return is_moving(robot) or robot.mode == ids.MODE_LOCOMOTION

@@ -27,15 +27,15 @@ CAUSES: Final = (
 )
 """Why the bridge has stopped or would refuse to arm.
 
-client_stop: the runner asked for it; client_lost: its connection has closed; deadman: no good command in time;
+client_stop: the runner requested it; client_lost: its connection has closed; deadman: no good command in time;
 shutdown: the bridge ends; suspended: the machine slept; estop: an operator, the local input or the remote's emergency
 keys; remote_takeover: a stick or key of the robot's remote; second_commander: motion or mode requests of another
 client, or a denied request of ours; second_publisher: an input topic has more than one publisher, or motor commands
 have one; link_down: the network does not take our commands; state_silent: no usable report from the robot;
 wrong_mode: it left its walking modes; robot_error: its error code; tipped: rolled or pitched beyond 30 degrees;
 robot_moving: found moving when the bridge started; not_standing: it did not stand up in time; battery_low: less charge
-than the robot file asks for; wrong_robot: its sport service has not the robot file's version, or it does not answer;
-operator: the robot file asks for an operator's `edge-bridge arm`, which has not come yet.
+than the robot file requires; wrong_robot: its sport service has another version than the robot file, or no answer;
+operator: the robot file requires an operator's `edge-bridge arm`, which is still missing.
 """
 PERMITS: Final = ("not needed", "needed", "given")
 """Whether the next arming needs an operator's `edge-bridge arm`, and whether it was given."""
@@ -51,22 +51,22 @@ _STATUS_BODY: Final = struct.Struct("<qBBBBBBQQQ4d")
 
 
 class LinkError(ValueError):
-    """Bytes that are no datagram of this link."""
+    """The bytes are not a datagram of this link."""
 
 
 @dataclass(frozen=True)
 class Arm:
-    """Operator's or runner's wish to drive."""
+    """Request of an operator or the runner to arm."""
 
 
 @dataclass(frozen=True)
 class Stop:
-    """Stop now and stay stopped."""
+    """Request to stop now and stay stopped."""
 
 
 @dataclass(frozen=True)
 class Release:
-    """Operator's wish that the bridge sends nothing, so that a person can use the robot's remote."""
+    """Operator's request that the bridge sends nothing, so that a person can use the robot's remote."""
 
 
 @dataclass(frozen=True)
@@ -82,12 +82,12 @@ class Velocity:
 
 @dataclass(frozen=True)
 class BridgeStatus:
-    """What the bridge is doing: `commands` velocity commands written to the robot, `last_command` the newest of them.
+    """State of the bridge. `commands`: number of velocity commands written to the robot; `last_command`: the newest.
 
-    `zero_after_stop`: stopped, and a zero velocity has been written since, and nothing else. It is True too when the
-    bridge never commanded the robot at all. `cause` (of CAUSES) is why it last stopped or refused to arm, `reason`
-    the same as a sentence; `blocked_by` (of CAUSES) is what would make it refuse to arm now. `permit` is one of
-    PERMITS, `motion` one of MOTIONS, `speed_mps` the robot's own speed, -1 without a fresh report.
+    `zero_after_stop`: stopped, and since then only zero velocity was written. It is True too when the bridge has never
+    commanded the robot. `cause` (of CAUSES): the last stop or refusal to arm, `reason` the same as a sentence.
+    `blocked_by` (of CAUSES): the reason against arming now. `permit` is one of PERMITS, `motion` one of MOTIONS,
+    `speed_mps` the robot's own speed, -1 without a fresh report.
     """
 
     stamp_ns: int
@@ -109,7 +109,7 @@ Message = Arm | Stop | Release | Velocity | BridgeStatus
 
 
 def encode(message: Message) -> bytes:
-    """Datagram of a message; the reason of a status is cut to what fits."""
+    """Encode a message as a datagram; the reason of a status is cut to fit."""
     if isinstance(message, Arm):
         return _frame(_ARM, b"")
     if isinstance(message, Stop):
@@ -131,7 +131,7 @@ def encode(message: Message) -> bytes:
 
 
 def decode(data: bytes) -> Message:
-    """Message of a datagram; raises LinkError for anything that `encode` cannot have made."""
+    """Decode a datagram; raises LinkError for bytes that `encode` cannot produce."""
     if len(data) < _HEADER.size:
         raise LinkError(f"{len(data)} bytes, shorter than a header")
     magic, version, kind, length = _HEADER.unpack_from(data)

@@ -12,7 +12,7 @@ States: disarmed -> arming -> armed -> stopped -> (explicit arm) arming ...
 An emergency stop (operator, remote keys, local input) latches in every state. Only an operator's arm for a waiting
 runner ends it (`permit.py`).
 A command is good when it is finite, its sequence number is larger than every earlier one of the connection, and its age
-lies between zero and the deadman time. Nothing that is received here can raise.
+is between zero and the deadman time. No received input can raise an exception.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ _NS_PER_MS: Final = 1_000_000
 _NS_PER_S: Final = 1_000_000_000
 _NEVER_NS: Final = -(2**62)
 _ZERO: Final = (0.0, 0.0, 0.0)
-# What brings a robot in this mode one step nearer to walking; a mode that is not listed gets RecoveryStand, which the
-# maker documents as working from any posture.
+# Request that brings a robot in this mode nearer to walking. Other modes get RecoveryStand, which the maker documents
+# as working from any posture.
 _NEXT_CALL: Final = {
     ids.MODE_IDLE: ids.STAND_UP,
     ids.MODE_LIE_DOWN: ids.STAND_UP,
@@ -43,7 +43,7 @@ _CALL_AGAIN_NS: Final = 3 * _NS_PER_S  # standing up takes up to 2 s and must no
 _MODES_ARMED: Final = frozenset({ids.MODE_IDLE, ids.MODE_BALANCE_STAND, ids.MODE_LOCOMOTION})
 _STOP_AGAIN_NS: Final = 100 * _NS_PER_MS
 _FOUND_MOVING_NS: Final = _NS_PER_S  # a Go2 holds its last Move for one second after its commander has died
-_STOPPING_NS: Final = 500 * _NS_PER_MS  # our choice: a robot that moves this long after a stop does not obey it
+_STOPPING_NS: Final = 500 * _NS_PER_MS  # our choice: time after a stop from which a moving robot counts as disobeying
 _ASLEEP_NS: Final = 100 * _NS_PER_MS
 _BURST_NS: Final = 1_000 * _NS_PER_MS  # longer than an operator's command repeats its stop
 _PRESSES: Final = (
@@ -57,12 +57,12 @@ _LATCHED: Final = "`edge-bridge arm` ends this while a runner waits"
 
 
 class BridgeCore:
-    """State machine and gate. One instance per bridge process; `step` may be called as often as one likes."""
+    """State machine and gate of one bridge process; `step` may be called at any rate."""
 
     def __init__(
         self, bridge: BridgeConfig, limits: LimitsConfig, safety: SafetyConfig, now_ns: int, *, latch: str = ""
     ) -> None:
-        """`latch`: reason of an emergency stop that an earlier bridge process has left, or empty."""
+        """`latch`: reason of an earlier bridge process's emergency stop, or empty."""
         self.clipped = 0
         self._safety = safety
         self._period_ns = _NS_PER_S // bridge.rate_hz
@@ -71,7 +71,7 @@ class BridgeCore:
         self._state_timeout_ns = bridge.state_timeout_ms * _NS_PER_MS
         self._low = (limits.vx_min_mps, -limits.vy_max_mps, -limits.wz_max_radps)
         self._high = (limits.vx_max_mps, limits.vy_max_mps, limits.wz_max_radps)
-        # Growth a tick, from the nominal period: a late tick must not allow a larger jump.
+        # Growth per tick, from the nominal period: a late tick must not allow a larger jump.
         self._growth = tuple(a / bridge.rate_hz for a in (limits.accel_mps2, limits.accel_mps2, limits.alpha_radps2))
         self._state, self._cause, self._reason = "disarmed", "none", "waiting for a client to arm"
         self._watch = DangerWatch(safety, self._state_timeout_ns)
@@ -89,12 +89,12 @@ class BridgeCore:
         self._requests: list[Move | Call] = []
 
     def step(self, inputs: Inputs, now_ns: int) -> Outputs:
-        """Take what happened, decide what goes to the robot now."""
+        """Take one step's inputs and return the requests and velocity for the robot."""
         self._requests = []
         self._watch.note(inputs, now_ns)
         self._note_connection(inputs, now_ns)
         if self._state == "armed" and now_ns > self._good_until_ns:
-            # Before the messages: what has queued up while this process stood still must not feed the deadman.
+            # Before the messages: those queued while this process was frozen must not satisfy the deadman.
             self._stop("deadman", "deadman: no good command in time", now_ns)
         self._handle_operator(inputs, now_ns)
         danger = self._danger(now_ns)
@@ -124,7 +124,7 @@ class BridgeCore:
         return Outputs(tuple(self._requests), self.status(now_ns), wake_ns, self._permit.latch)
 
     def status(self, now_ns: int) -> BridgeStatus:
-        """State of the bridge as its clients see it."""
+        """Return the status of the bridge for its clients."""
         blocked, zero_after_stop = self._blocked(now_ns), self._state != "armed" and not self._released
         counters = (max(self._last_seq, 0), self._commands, self._rejected, self._last_command, zero_after_stop)
         causes = (self._cause, "none" if blocked is None else blocked[0])
@@ -138,7 +138,7 @@ class BridgeCore:
         if inputs.client and not self._had_client:
             self._last_seq = -1  # numbering is per connection
         if not (inputs.client and self._had_client):
-            # Also when a client is new: the last Arm of the client before it may have arrived with its disconnection.
+            # Also for a new client: the previous client's last Arm may have arrived with its disconnection.
             self._permit.void(disconnected=True)
         self._had_client = inputs.client
         if self._asleep_ns is not None and inputs.asleep_ns - self._asleep_ns > _ASLEEP_NS:
@@ -146,7 +146,7 @@ class BridgeCore:
         self._asleep_ns = inputs.asleep_ns
 
     def _handle_operator(self, inputs: Inputs, now_ns: int) -> None:
-        """Emergency stops of every source, then an operator's arm or release; a stop beside them wins."""
+        """Handle emergency stops of every source, then an operator's arm or release; a stop takes precedence."""
         stop = any(isinstance(message, Stop) for message in inputs.operator)
         pressed = (stop, inputs.estop, inputs.robot.remote_estop)
         for is_pressed, reason in zip(pressed, _PRESSES, strict=True):
@@ -163,7 +163,7 @@ class BridgeCore:
         self._rejected += sum(not isinstance(message, accepted) for message in inputs.operator)
 
     def _engage(self, now_ns: int) -> None:
-        """A new press: end a release, and stop a robot that moves although this bridge has not driven it."""
+        """Handle a new press: end a release, and stop a robot that moves although this bridge has not driven it."""
         if self._released:
             self._released, self._reason = False, self._permit.latch
         if now_ns - self._pressed_ns > _BURST_NS:  # an operator's stop is repeated until it is confirmed
@@ -190,13 +190,13 @@ class BridgeCore:
             self._reason = "released by an operator: the bridge sends nothing until the next arming"
 
     def _danger(self, now_ns: int) -> Reason | None:
-        """What forbids motion now, in every state."""
+        """Return what forbids motion now, in every state."""
         if self._permit.latch and not self._permit.allows(now_ns):
             return "estop", f"{self._permit.latch}; {_LATCHED}"
         return self._watch.danger(now_ns)
 
     def _blocked(self, now_ns: int) -> Reason | None:
-        """Why an arm would be refused now."""
+        """Return why an arm would be refused now."""
         reason = self._danger(now_ns) or self._watch.obstacle(now_ns)
         if reason is None and not self._permit.allows(now_ns):
             return "operator", "waiting for an operator's `edge-bridge arm`"
@@ -207,7 +207,7 @@ class BridgeCore:
             return
         self._permit.ask(now_ns)
         if not self._permit.allows(now_ns):
-            # Before everything else and without a change of state: a runner may ask for hours.
+            # Before everything else and without a change of state: a runner may repeat the request for hours.
             latch = f" ({self._permit.latch})" if self._permit.latch else ""
             self._cause, self._reason = "operator", f"arm refused: waiting for an operator's `edge-bridge arm`{latch}"
             return
@@ -218,7 +218,7 @@ class BridgeCore:
         self._called, self._watch.version, self._asked_ns = {}, None, _NEVER_NS
 
     def _accept(self, command: Velocity, now_ns: int) -> None:
-        """The gate. A command that is not good counts as absent, so the deadman goes on running."""
+        """Take a command if it is good; otherwise it counts as absent, so the deadman keeps running."""
         velocity = (command.vx_mps, command.vy_mps, command.wz_radps)
         fresh = 0 <= now_ns - command.stamp_ns <= self._deadman_ns
         driving = self._state in ("arming", "armed")
@@ -248,7 +248,7 @@ class BridgeCore:
                 self._stop("not_standing", f"the robot is in mode {robot.mode}, not standing {waited}", now_ns)
         elif self._watch.version is None:
             if now_ns - self._asked_ns >= _NS_PER_S:
-                self._asked_ns, self._reason = now_ns, "asking the robot for its version"
+                self._asked_ns, self._reason = now_ns, "requesting the robot's version"
                 self._requests.append(Call(ids.API_VERSION))
         else:
             walks = robot.mode == ids.MODE_BALANCE_STAND and is_moving(robot)
@@ -259,7 +259,7 @@ class BridgeCore:
         if mode == ids.MODE_BALANCE_STAND:
             self._state, self._reason, self._ever_armed = "armed", "driving", True
             self._permit.finish()
-            # The runner streams commands while arming; one that only starts now gets a deadman time to do so.
+            # The runner streams commands while arming; one that starts only now has a deadman time to do so.
             self._good_until_ns = max(self._good_until_ns, now_ns + self._deadman_ns)
             self._next_ns = now_ns
         elif now_ns - self._called.get(call, _NEVER_NS) >= _CALL_AGAIN_NS:
@@ -271,7 +271,7 @@ class BridgeCore:
     def _check_armed(self, now_ns: int) -> None:
         robot = self._watch.fresh(now_ns, self._state_timeout_ns)
         if robot is None:
-            self._stop("state_silent", "the robot's state has gone silent", now_ns)
+            self._stop("state_silent", "no state from the robot any more", now_ns)
         elif robot.mode not in _MODES_ARMED:
             self._stop("wrong_mode", f"the robot left its walking modes (mode {robot.mode})", now_ns)
 
@@ -290,12 +290,12 @@ class BridgeCore:
         self._target, self._stopped_ns = _ZERO, now_ns
 
     def _stop_if_found_moving(self, now_ns: int) -> None:
-        """A bridge that died while driving left a moving robot behind; its successor stops it before anything else."""
+        """Stop a robot that an earlier, killed bridge left moving, before anything else."""
         robot, first_ns = self._watch.robot, self._watch.first_report_ns
         if self._state != "disarmed" or self._ever_armed or first_ns is None or robot is None:
             return
         if is_walking(robot) and now_ns - first_ns <= _FOUND_MOVING_NS:
-            self._state, self._ever_armed = "armed", True  # the state of its predecessor
+            self._state, self._ever_armed = "armed", True  # the previous bridge's state
             self._stop("robot_moving", "the robot was moving when the bridge started; stopped it", now_ns)
 
     def _tick(self, now_ns: int) -> None:
@@ -312,7 +312,7 @@ class BridgeCore:
                 self._send_stop(now_ns)
 
     def _slew(self) -> tuple[float, float, float]:
-        """The target, approached: each component may grow by accel/rate a tick, and shrink or change sign at once."""
+        """Approach the target: a component may grow by accel/rate per tick, and shrink or change sign at once."""
         vx, vy, wz = (
             math.copysign(min(abs(to), (abs(at) if at * to > 0 else 0.0) + growth), to)
             for to, at, growth in zip(self._target, self._last_command, self._growth, strict=True)

@@ -1,4 +1,4 @@
-"""What one step of the bridge reads and writes: frozen values without behaviour."""
+"""Inputs and outputs of one step of the bridge: frozen values without behaviour."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from firmware_bridge.core.robot_state import RobotState
 
 @dataclass(frozen=True)
 class Report:
-    """What arrived over the robot's network since the last step.
+    """Messages from the robot's network since the last step.
 
     `remote_in_use`: a stick or key of the robot's remote is in use. `remote_estop`: its emergency-stop keys were
     pressed. `foreign` names a motion or mode request of another client. `denied` names a request of ours that the
     robot denied because another client holds its lease. `publishers` names the input topic that has more than one
-    publisher, or that a foreign program publishes motor commands. `version` is the sport service's answer to our
-    question. `writes_fail`: the network has refused our last commands.
+    publisher, or reports a foreign publisher of motor commands. `version` is the sport service's version from its
+    answer. `writes_fail`: the network has refused our last commands.
     """
 
     state: RobotState | None = None
@@ -33,10 +33,10 @@ class Report:
 
 @dataclass(frozen=True)
 class Inputs:
-    """What happened since the last step, oldest first; `client`: a runner is connected now.
+    """Events since the last step, oldest first; `client`: a runner is connected now.
 
-    `operator`: messages of the operator's socket. `estop`: the local emergency stop is pressed. `asleep_ns`: time for
-    which this machine has been suspended since it was switched on, which the monotonic clock leaves out.
+    `operator`: messages of the operator's socket. `estop`: the local emergency stop is pressed. `asleep_ns`: time that
+    this machine has spent suspended since boot, which the monotonic clock leaves out.
     """
 
     messages: Sequence[Message] = ()
@@ -68,7 +68,7 @@ class Call:
 class Outputs:
     """Requests to write in this order, the state afterwards, and when `step` must run again at the latest.
 
-    `latch`: why an emergency stop holds, empty without one; it must survive a restart of the bridge.
+    `latch`: reason of a latched emergency stop, empty without one; it must survive a restart of the bridge.
     """
 
     requests: tuple[Move | Call, ...]

@@ -1,7 +1,7 @@
-"""A network interface that appears after the bridge has started: a cable plugged in late, an address set late.
+"""Waits for a network interface that appears after the bridge has started: a late cable, a late address.
 
-Until then the bridge runs as always with an `AbsentRobot` in the place of its `RobotLink`: it keeps its sockets, its
-rules, its watchdog and every emergency stop that an operator gives.
+Until then the bridge runs with an `AbsentRobot` in place of its `RobotLink`: it keeps its sockets, its rules, its
+watchdog and every emergency stop of an operator.
 """
 
 from __future__ import annotations
@@ -29,24 +29,24 @@ class AbsentRobot:
 
     @property
     def reason(self) -> str:
-        """What the bridge waits for, in one line."""
+        """The missing interface, in one line."""
         found = ", ".join(name for _, name in socket.if_nameindex())
         return f"waiting for interface {self.interface!r} with an IPv4 address (interfaces: {found})"
 
     def read(self, now_ns: int) -> Report:
-        """No state and a network that takes no commands, so that the core refuses every arm with `link_down`."""
+        """Return a report with failing writes and no state, so that the core refuses to arm with `link_down`."""
         return Report(writes_fail=True)
 
     def write(self, request: Move | Call) -> None:
         """Drop the request: there is nowhere to send it."""
 
     def dropped(self) -> tuple[int, int, int]:
-        """Impossible messages, states out of order, failed writes: none."""
+        """Return the counts of impossible messages, states out of order and failed writes: all 0."""
         return 0, 0, 0
 
 
 def is_interface_up(interface: str) -> bool:
-    """Whether DDS can join on this interface: up, with an IPv4 address. An address stands for its interface."""
+    """Return whether DDS can join on this interface: up, with an IPv4 address. An address names its interface."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.bind((str(IPv4Address(interface)), 0))

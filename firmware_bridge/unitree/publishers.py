@@ -1,7 +1,7 @@
-"""Publishers of the topics that the bridge trusts, counted by DDS discovery.
+"""Counts by DDS discovery the publishers of the topics that the bridge trusts.
 
 DDS of the robot is not authenticated: a second publisher of an input topic is another robot or a forger, and a
-publisher of motor commands moves the robot beside the sport service. Both are seen before their first sample.
+publisher of motor commands bypasses the sport service. Discovery shows both before their first sample.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from firmware_bridge.unitree.dds import DDS_ERRORS, DECODE_ERRORS, Bus
 from firmware_bridge.unitree.messages import ids
 
 _FEW: Final = 16  # announcements a step
-_MOST: Final = 64  # publishers kept; more are a flood, which must not cost memory or time
+_MOST: Final = 64  # publishers kept; a flood of more must not cost memory or time
 INPUT_TOPICS: Final = (
     *(ids.SPORT_STATE_TOPIC, ids.LF_LOW_STATE_TOPIC, ids.REMOTE_TOPIC),
     ids.response_topic(ids.SPORT_SERVICE),
@@ -24,10 +24,10 @@ INPUT_TOPICS: Final = (
 
 
 class PublisherWatch:
-    """Counts the publishers of `INPUT_TOPICS` and of the motor commands, those of this process left out."""
+    """Counts other processes' publishers of `INPUT_TOPICS` and of the motor commands."""
 
     def __init__(self, bus: Bus, own_motor_publishers: int) -> None:
-        """`own_motor_publishers`: how many publishers of motor commands belong to the robot itself."""
+        """`own_motor_publishers`: number of the robot's own publishers of motor commands."""
         self._own = str(bus.participant.guid)
         self._allowed: Mapping[str, int] = {
             **dict.fromkeys(INPUT_TOPICS, 1),
@@ -38,7 +38,7 @@ class PublisherWatch:
         self._reader: Any = BuiltinDataReader(bus.participant, BuiltinTopicDcpsPublication)
 
     def surplus(self) -> str | None:
-        """Take the announcements that wait; which topic has more publishers than it should have."""
+        """Take the waiting announcements; return a line about a topic with too many publishers, else None."""
         for _ in range(_FEW):
             samples: list[Any] = []
             with contextlib.suppress(*DECODE_ERRORS, *DDS_ERRORS):
@@ -50,14 +50,14 @@ class PublisherWatch:
         for topic in self._topics.values():
             counts[topic] += 1
         if self._flooded:
-            return f"more than {_MOST} publishers of the robot's topics; restart the bridge once they have gone"
+            return f"more than {_MOST} publishers of the robot's topics; end them, then restart the bridge"
         for topic, allowed in self._allowed.items():
             if counts[topic] > allowed:
                 return f"{counts[topic]} publishers of {topic}, expected {allowed}"
         return None
 
     def _note(self, sample: Any) -> None:
-        if not sample.sample_info.valid_data:  # this publisher has left
+        if not sample.sample_info.valid_data:  # this publisher has ended
             self._topics.pop(str(sample.key), None)
         elif str(sample.participant_key) != self._own and sample.topic_name in self._allowed:
             self._flooded = self._flooded or len(self._topics) >= _MOST

@@ -1,4 +1,4 @@
-"""The emergency-stop keys of the robot's remote. Pure: samples in, one answer out."""
+"""Detects the emergency-stop keys of the robot's remote. Pure."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from typing import Final
 from firmware_bridge.unitree.messages.ids import REMOTE_KEYS
 
 TOGETHER_NS: Final = 500_000_000
-"""Keys pressed within this time of each other count as one combination: nobody presses two keys in one 20 ms sample,
-and a sample with both of them can be lost."""
+"""Time within which key presses count as one combination: a person rarely presses two keys within one 20 ms sample,
+and a sample with both can be lost."""
 _NEVER_NS: Final = -(2**62)
 
 
 class StopKeys:
-    """Notices the emergency-stop combination in any order of its keys."""
+    """Detector of the emergency-stop combination, in any order of its keys."""
 
     def __init__(self, keys: Sequence[str]) -> None:
         """`keys`: names of `REMOTE_KEYS`, all of them needed."""
         self._pressed_ns = {1 << REMOTE_KEYS.index(key): _NEVER_NS for key in keys}
 
     def press(self, keys: int, now_ns: int) -> bool:
-        """Take the key bits of one sample; whether the combination is complete now."""
+        """Take the key bits of one sample; return whether the combination is complete."""
         for bit in self._pressed_ns:
             if keys & bit:
                 self._pressed_ns[bit] = now_ns

@@ -1,7 +1,7 @@
-"""Requests to one of the robot's services, sent without waiting; answers as they come.
+"""Sends requests to one of the robot's services and collects answers, without waiting.
 
-The robot is an untrusted peer (faults table, "Unitree, known hazards"): what it sends is bounded, matched by identity
-id and otherwise dropped and counted. All that the bridge uses; calls that wait are in `rpc.py`.
+The robot is an untrusted peer (faults table, "Unitree, known hazards"): its messages are bounded and matched by
+identity id; all others are dropped and counted. The bridge uses only this module; calls that wait are in `rpc.py`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Response:
 
     @classmethod
     def checked(cls, sample: idl.Response_ | None) -> Response | None:
-        """The sample's content, or None when it did not decode or is larger than any real answer."""
+        """Return the sample's content; None when it does not decode or is larger than any valid answer."""
         if sample is None or len(sample.data) > MAX_DATA_CHARS or len(sample.binary) > MAX_BINARY_BYTES:
             return None
         identity, status = sample.header.identity, sample.header.status
@@ -39,19 +39,19 @@ class Response:
 
 
 def make_request(request_id: int, api_id: int, parameter: str, *, noreply: bool) -> idl.Request_:
-    """A request without lease, priority or binary part, as the maker's client sends it."""
+    """Build a request without lease, priority or binary part, as the maker's client does."""
     identity = idl.RequestIdentity_(request_id, api_id)
     header = idl.RequestHeader_(identity, idl.RequestLease_(0), idl.RequestPolicy_(0, noreply))
     return idl.Request_(header, parameter, b"")
 
 
 def move_parameter(vx_mps: float, vy_mps: float, wz_radps: float) -> str:
-    """Parameter text of the sport service's Move."""
+    """Format the parameter of the sport service's Move."""
     return json.dumps({"x": vx_mps, "y": vy_mps, "z": wz_radps})
 
 
 class Requester:
-    """One service as a client sees it; nothing here waits."""
+    """Client of one service; no method waits."""
 
     def __init__(self, bus: Bus, service: str, *, allowed: frozenset[int] | None = None) -> None:
         """`allowed`: the only API ids this client may put on the wire; None allows every id."""
@@ -59,16 +59,16 @@ class Requester:
         self.malformed = 0
         self.failed_writes = 0
         self.failing = 0
-        """Writes that have failed in a row, up to now."""
+        """Number of failed writes in a row, up to now."""
         self._allowed = allowed
         self._last_id = 0
         self._writer = bus.writer(request_topic(service), idl.Request_)
         self._reader = bus.reader(response_topic(service), idl.Response_, depth=8, reliable=True)
 
     def send(self, api_id: int, parameter: str = "", *, noreply: bool = False) -> int | None:
-        """Write a request without waiting for anything; its id, or None when DDS did not take it.
+        """Write a request without waiting; return its id, or None when DDS did not accept it.
 
-        Raises ValueError for an id outside the allow-list: that is a defect of the caller, never of its input.
+        Raises ValueError for an id outside the allow-list: a defect of the caller, never of its input.
         """
         if self._allowed is not None and api_id not in self._allowed:
             raise ValueError(f"{self.service}: api id {api_id} is not on the allow-list")
@@ -83,9 +83,9 @@ class Requester:
         return self._last_id
 
     def responses(self, limit: int = 64, max_bytes: int = MAX_SAMPLE_BYTES) -> list[Response]:
-        """Answers that have arrived since the last call, other clients' included; at most `limit` of them.
+        """Return at most `limit` answers received since the last call, other clients' included.
 
-        One of more than `max_bytes` counts as malformed without being decoded.
+        An answer of more than `max_bytes` counts as malformed and is not decoded.
         """
         answers = []
         for sample in take_each(self._reader, limit, max_bytes):

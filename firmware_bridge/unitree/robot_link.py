@@ -1,4 +1,4 @@
-"""The bridge's end of the robot's network: what arrives there as one `Report` a step, and the requests it writes."""
+"""The bridge's end of the robot's network: one `Report` of the received messages per step, and written requests."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ _MAX_VERSION_CHARS: Final = 40
 _FAILING_WRITES: Final = 3  # in a row: 60 ms at 50 Hz, inside the 100 ms of fault matrix row 46
 _BATTERY_PERIOD_NS: Final = 1_000_000_000  # decoding a low state costs as much as ten other messages
 _MAX_STICK: Final = 1.5  # full travel is 1
-_FEW: Final = 4  # samples of one topic a step: 200 a second, and none of them takes long
-_MAX_BYTES: Final = 4096  # a low state, the largest of what is read here, has 1180
+_FEW: Final = 4  # samples of one topic per step: 200 a second, each decoded quickly
+_MAX_BYTES: Final = 4096  # a low state, the largest message read here, has 1180
 _MAX_KEPT_BYTES: Final = 1024 * 1024  # times 51, the depth of all readers: far below the service's MemoryMax
 
 
 class RobotLink:
-    """All readers and the only writer. Nothing here waits. Raises DdsError when the bus cannot be joined."""
+    """All readers and the only writer; no method waits. Raises DdsError when the DDS domain cannot be joined."""
 
     def __init__(self, config: RobotConfig, report: Callable[[str], None]) -> None:
         """`report` takes one line when the robot answers a request with an error."""
@@ -51,15 +51,15 @@ class RobotLink:
         self._publishers = PublisherWatch(bus, config.safety.robot_lowcmd_publishers)
         self._order = StampOrder()
         self._battery_due_ns = 0
-        self._sent: dict[int, int] = {}  # request id -> api id, of what has not been answered
+        self._sent: dict[int, int] = {}  # request id -> api id of unanswered requests
         self._malformed = 0
 
     def dropped(self) -> tuple[int, int, int]:
-        """How much so far: impossible messages, states out of order, requests that the network did not take."""
+        """Return counts so far: impossible messages, states out of order, requests that the network did not accept."""
         return self._malformed + self._sport.malformed, self._order.dropped, self._sport.failed_writes
 
     def read(self, now_ns: int) -> Report:
-        """Everything that has arrived since the last call."""
+        """Return the report of all messages since the last call."""
         in_use, estop = self._remote(now_ns)
         state, foreign, battery_percent = self._newest_state(), self._foreign(), self._battery_percent(now_ns)
         version, denied = self._answers()
@@ -88,7 +88,7 @@ class RobotLink:
         return newest
 
     def _remote(self, now_ns: int) -> tuple[bool, bool]:
-        """Whether a stick or key is in use, whether the emergency-stop keys were pressed together."""
+        """Return whether a stick or key is in use, and whether the emergency-stop keys were pressed together."""
         in_use = estop = False
         for sample in _few(self._remotes):
             if sample is None:
@@ -122,7 +122,7 @@ class RobotLink:
         return percent
 
     def _answers(self) -> tuple[str | None, str | None]:
-        """The sport service's version, and the request that it has denied; errors go to the operator."""
+        """Return the sport service's version and the request that it has denied; report errors to the operator."""
         version = denied = None
         for answer in self._sport.responses(_FEW, _MAX_BYTES):
             api_id = self._sent.pop(answer.request_id, None)

@@ -28,7 +28,7 @@ from tokenizers import Tokenizer
 
 from edge.core.cli import EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
 from edge.core.geometry import SE2
-from edge.reasoning.prompt import EXAMPLE_BEFORE, EXAMPLE_WAY, PromptBuilder, PromptIds
+from edge.reasoning.prompt import EXAMPLE_BEFORE, EXAMPLE_PAST_PATH, PromptBuilder, PromptIds
 from edge.state.ring import EncodedFrame
 from export.checkpoint.load import load_checkpoint
 from export.checkpoint.tokenizer import tokenizer_for
@@ -78,7 +78,7 @@ class Work:
         nothing = np.zeros((1, 1, 1), dtype=np.float32)
         encoded = [EncodedFrame(i, SE2(0.3 * i, 0.0, 0.0), nothing) for i in range(self.frames)]
         return noisy, [
-            i for segment in builder.build(encoded, INSTRUCTION, EXAMPLE_WAY, EXAMPLE_BEFORE) for i in segment.ids
+            i for segment in builder.build(encoded, INSTRUCTION, EXAMPLE_PAST_PATH, EXAMPLE_BEFORE) for i in segment.ids
         ]
 
 

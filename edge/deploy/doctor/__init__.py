@@ -1,1 +1,1 @@
-"""`edge-doctor`: checks this machine, the artifacts and the link to the robot, and tells what to do."""
+"""`edge-doctor`: checks this machine, the artifacts and the link to the robot, and advises what to do."""

@@ -1,4 +1,4 @@
-"""One line of `edge-doctor`: what was checked, what was found, what was expected, what to do."""
+"""One result of `edge-doctor`: the check, the found and expected values, the advice."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from rich.table import Table
 
 
 class Level(Enum):
-    """How a check ended."""
+    """Level of a check's result."""
 
     OK = "ok"
     WARN = "warn"
-    """Worth knowing; the robot may be driven."""
+    """A warning; the robot may be driven."""
     FAIL = "fail"
-    """The robot must not be driven like this, or would refuse to."""
+    """A failure; the robot must not be driven or would refuse."""
     SKIP = "skip"
-    """Could not be checked here; `found` tells why."""
+    """The check was not possible; `found` gives the reason."""
 
 
 _STYLES = {Level.OK: "green", Level.WARN: "yellow", Level.FAIL: "bold red", Level.SKIP: "dim"}
@@ -35,7 +35,7 @@ class Check:
     found: str
     expected: str = ""
     advice: str = ""
-    """What to do; for every check that warns or fails."""
+    """The next step; required for a warning or a failure."""
 
     def __post_init__(self) -> None:
         if not self.name or not self.found:
@@ -49,17 +49,17 @@ class Check:
 
 
 def skipped(name: str, why: str) -> Check:
-    """A check that could not be made."""
+    """Return the result of a check that was not possible."""
     return Check(name, Level.SKIP, f"skipped: {why}")
 
 
 def failed(checks: Iterable[Check]) -> bool:
-    """Whether any of them failed."""
+    """Return whether any check failed."""
     return any(check.level is Level.FAIL for check in checks)
 
 
 def table(checks: Iterable[Check]) -> Table:
-    """The checks for a terminal: what was found, and below it what to do where there is something to do."""
+    """Return a terminal's table of the checks, with advice below each warning and failure."""
     made = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
     made.add_column(no_wrap=True)
     made.add_column(no_wrap=True)

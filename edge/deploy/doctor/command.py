@@ -1,4 +1,4 @@
-"""`edge-doctor`: checks this machine, the artifacts and the link to the robot, and tells what to do."""
+"""`edge-doctor`: checks this machine, the artifacts and the link to the robot, and advises what to do."""
 
 from __future__ import annotations
 
@@ -52,14 +52,14 @@ EXAMPLES = """examples:
        --socket /run/tic-vla-edge/bridge.sock --user tic-vla-runner
   edge-doctor
 
-What is not given is not checked and shown as skipped. It opens the graphs and runs ticks on a black picture; it asks
-the bridge and the robot for their state and one picture, and never commands anything.
+Checks without their option are skipped. It opens the graphs and runs ticks on a black picture; it reads the state of
+the bridge and the robot and one picture, and never commands anything.
 exit codes: 0 no check failed (warnings may have been given), 1 a check failed, 2 bad arguments, 130 interrupted
 """
 TICKS = 100
 TICK_BUDGET_S = 20.0
 SETTLE_S = 0.5
-"""Between two readings of what other programs use."""
+"""Time between two readings of other programs' processor use."""
 ROOT = Path("/")
 T = TypeVar("T")
 
@@ -75,7 +75,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--engines", type=Path, metavar="DIR", help="engines (default: ARTIFACTS.engines)")
     p.add_argument("--socket", type=Path, metavar="PATH", help="socket of edge-bridge (default: the robot file's)")
     p.add_argument("--domain", type=int, metavar="N", help="DDS domain (default: the robot file's)")
-    p.add_argument("--logs", type=Path, metavar="DIR", help=f"where flight logs go (default: {STATE_DIRECTORY} or .)")
+    p.add_argument("--logs", type=Path, metavar="DIR", help=f"flight logs' folder (default: {STATE_DIRECTORY} or .)")
     p.add_argument("--user", metavar="NAME", help="user whose rights are checked, e.g. the service's (default: you)")
     p.add_argument("--ticks", type=int, default=TICKS, metavar="N", help=f"ticks to time (default: {TICKS}; 0: none)")
     p.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
@@ -91,7 +91,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if args.ticks < 0:
         raise ConfigError(f"--ticks {args.ticks}: expected 0 or more")
     checks = list(examine(args))
-    # The table is for people; with --json - standard output is the JSON's alone.
+    # With `--json -` standard output carries the JSON only, without the table.
     Console(stderr=args.json == "-").print(table(checks))
     counts = {level.value: sum(check.level is level for check in checks) for level in Level}
     wall_s = round((time.monotonic_ns() - started_ns) / 1e9, 3)
@@ -104,9 +104,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def examine(args: argparse.Namespace, root: Path = ROOT) -> Iterator[Check]:
-    """Every check, in the order in which they are shown; `root`: where Linux's files are read."""
+    """Run every check, in the order of the table; `root`: root folder of Linux's files."""
     user = user_named(args.user)
-    # Before anything of ours computes.
+    # Before this program computes.
     busy = _busy(root / "proc")
     robot, robot_check = _robot(args)
     loaded, artifact_check = _artifacts(args)
@@ -133,7 +133,7 @@ def examine(args: argparse.Namespace, root: Path = ROOT) -> Iterator[Check]:
 
 
 def _read_facts(refused: list[Check], name: str, read: Callable[[], T]) -> T | None:
-    """Facts from the manifest; None, and a failed check in `refused`, where it is not as edge-export writes it."""
+    """Return a fact of the manifest; None, and a failed check in `refused`, where the manifest is malformed."""
     try:
         return read()
     except ArtifactError as error:
@@ -148,7 +148,7 @@ def _robot(args: argparse.Namespace) -> tuple[RobotConfig | None, Check]:
     try:
         robot = load_robot_config(args.robot, socket=args.socket, domain=args.domain)
     except ConfigError as error:
-        return None, Check(name, Level.FAIL, str(error), "a robot file", "correct what the message names")
+        return None, Check(name, Level.FAIL, str(error), "a robot file", "correct the key that the message names")
     return robot, Check(name, Level.OK, f"{robot.name}, {robot.protocol}")
 
 

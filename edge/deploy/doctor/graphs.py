@@ -1,4 +1,4 @@
-"""Checks of the graphs on this machine: which provider every node really got, and how long a tick really takes."""
+"""Checks of the graphs on this machine: the provider that runs each node, and the measured duration of a tick."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ SHAPE_OPERATORS: Final = frozenset(
         "Reshape", "Shape", "Size", "Slice", "Squeeze", "Sub", "Unsqueeze",
     }
 )  # fmt: skip
-"""Operators that ONNX Runtime itself puts on the processor when they only reckon with shapes."""
+"""Operators that ONNX Runtime itself runs on the processor when they only compute shapes."""
 SHAPE_BYTES: Final = 1024
-"""Largest output of such a node: shapes are a few numbers."""
+"""Largest output of such a node, bytes: shapes are a few numbers."""
 COPIES: Final = ("MemcpyFromHost", "MemcpyToHost")
 SLOWER: Final = 1.25
-"""Measured median tick as a multiple of the plan's upper bound from which the plan does not hold here."""
+"""Multiple of the plan's upper bound from which a measured median tick contradicts the plan."""
 LEAST_TICKS: Final = 5
 
 
@@ -48,7 +48,7 @@ class Placement:
 
 
 def placements(events: Iterable[Any]) -> list[Placement]:
-    """Where every node ran, from the events of an ONNX Runtime profile; raises ValueError for another kind of file."""
+    """Read each node's provider from an ONNX Runtime profile; raises ValueError for another kind of file."""
     found: dict[tuple[str, str], list[tuple[str, int, int]]] = {}
     for event in events:
         if not isinstance(event, dict) or event.get("cat") != "Node":
@@ -71,7 +71,7 @@ def placements(events: Iterable[Any]) -> list[Placement]:
 
 
 def judge_placement(graph: str, wanted: str, placed: Sequence[Placement]) -> Check:
-    """No node may have fallen back to the processor, but for those that only reckon with shapes."""
+    """Check that no node fell back to the processor, except nodes that only compute shapes."""
     name = f"provider of {graph}"
     by_provider: dict[str, int] = {}
     for place in placed:
@@ -92,7 +92,7 @@ def _harmless(place: Placement) -> bool:
 
 
 def profile_graph(artifacts: Artifacts, name: str) -> Check:
-    """Open a graph as the runner does, run it once under ONNX Runtime's profiler and judge where its nodes ran."""
+    """Open a graph as the runner does, run it once under ONNX Runtime's profiler and check its nodes' providers."""
     contract = artifacts.graphs[name]
     wanted = contract.session.provider
     with tempfile.TemporaryDirectory(prefix="edge-doctor-") as folder:
@@ -110,14 +110,14 @@ def profile_graph(artifacts: Artifacts, name: str) -> Check:
             session.run(None, example_feeds(artifacts, contract))
             events = json.loads(Path(session.end_profiling()).read_text(encoding="utf-8"))
             return judge_placement(name, wanted, placements(events))
-        except Exception as error:  # noqa: BLE001 - ONNX Runtime raises whatever its providers do; that is the finding
+        except Exception as error:  # noqa: BLE001 - ONNX Runtime raises any error of its providers; that is the finding
             reason = (str(error).splitlines() or [type(error).__name__])[0]
             advice = "verify the artifacts (edge-export verify), then the provider's packages"
             return Check(f"provider of {name}", Level.FAIL, f"does not run: {reason}", wanted, advice)
 
 
 def example_feeds(artifacts: Artifacts, contract: GraphContract) -> dict[str, Array]:
-    """Zeros for every input of a graph, of the shapes of a short prompt's first call."""
+    """Return zeros for every input of a graph, in the shapes of a short prompt's first call."""
     axes = {"S": 1, "F": 1, "T": artifacts.runtime.frame_tokens, "C": artifacts.runtime.max_context}
     feeds = {tensor.name: zeros(tensor, **axes) for tensor in contract.inputs}
     if "total_sequence_length" in feeds:
@@ -126,7 +126,7 @@ def example_feeds(artifacts: Artifacts, contract: GraphContract) -> dict[str, Ar
 
 
 def measure_ticks(artifacts: Artifacts, count: int, budget_s: float, prompt_tokens: int) -> list[float]:
-    """Durations in ms of ticks on a black frame (encode and act); fewer than `count` when the time budget is used up.
+    """Measure ticks on a black frame (encode and act), ms; fewer than `count` when the time budget is used up.
 
     Raises ArtifactError or GraphError.
     """
@@ -148,7 +148,7 @@ def measure_ticks(artifacts: Artifacts, count: int, budget_s: float, prompt_toke
 
 
 def judge_ticks(times_ms: Sequence[float], plan: PlanFacts | None, period_ms: int) -> Check:
-    """Measured ticks against the period and the plan."""
+    """Check measured ticks against the period and the plan."""
     name = "tick"
     if not times_ms:
         return skipped(name, "no tick was run")
@@ -161,6 +161,6 @@ def judge_ticks(times_ms: Sequence[float], plan: PlanFacts | None, period_ms: in
         advice = "this machine cannot keep the rate: check power mode and clocks, or export with a faster precision"
         return Check(name, Level.FAIL, found, expected, advice)
     if plan is not None and p50 > SLOWER * plan.tick_alone_ms * (1 + plan.tick_error):
-        advice = "slower than planned: check power mode, clocks and busy programs; edge-calib latency measures anew"
+        advice = "slower than planned: check power mode, clocks and busy programs; edge-calib latency measures again"
         return Check(name, Level.WARN, found, expected, advice)
     return Check(name, Level.OK, found, expected)

@@ -1,4 +1,4 @@
-"""Checks of the machine from the files in which Linux and Jetson describe it; the root can be another folder."""
+"""Checks of the machine from the files of Linux and Jetson; the root can be another folder."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from edge.deploy.doctor.check import Check, Level, skipped
 from edge.flightlog.recorder import ARMING_FREE_SHARE
 
 SPARE_MEMORY: Final = 1.2
-"""Free memory as a multiple of the plan's need; less is a warning."""
+"""Multiple of the plan's memory below which the free memory gives a warning."""
 BUSY_CORES: Final = 0.5
-"""Cores that other programs may use together; more is a warning."""
+"""Cores in use by other programs above which there is a warning."""
 STEADY_GOVERNORS: Final = ("performance",)
 _COARSE_CLOCKS: Final = ("jiffies", "acpi_pm", "hpet", "refined-jiffies")
 _GPU_NAMES: Final = ("ga10b", "gpu")
@@ -34,10 +34,10 @@ MODULES: Final[Mapping[str, tuple[str, int]]] = {
 }
 """Jetson modules and their GiB, by the names that NVIDIA's device trees and flash configurations use."""
 MEMORY_SHARE: Final = 0.85
-"""Firmware and kernel keep some of what is on the data sheet: of 16 GiB an Orin NX shows about 15.3."""
+"""Share of the data sheet's memory that firmware and kernel leave: of 16 GiB an Orin NX shows about 15.3."""
 
 Query = Callable[[], str | None]
-"""Runs `nvpmodel -q`; None if there is no such program or it fails."""
+"""Runs `nvpmodel -q` and returns its output; None if the program is missing or fails."""
 
 
 def _text(path: Path) -> str:
@@ -48,7 +48,7 @@ def _text(path: Path) -> str:
 
 
 def power_mode(wanted: str, root: Path, query: Query) -> Check:
-    """The board's power mode by name, and that it has really been taken: `nvpmodel -q` may name one that was not."""
+    """Check the board's power mode by name and by its online cores: `nvpmodel -q` may name a mode before its reboot."""
     name = "power mode"
     conf = _text(root / "etc/nvpmodel.conf")
     if not conf:
@@ -61,22 +61,22 @@ def power_mode(wanted: str, root: Path, query: Query) -> Check:
     except DeviceError as error:
         problem, _, advice = str(error).partition(": ")
         return Check(name, Level.FAIL, problem, wanted, advice)
-    asked, online = mode_cores(conf, wanted), core_numbers(_text(root / "sys/devices/system/cpu/online"))
-    if asked and online and asked != online:
+    required, online = mode_cores(conf, wanted), core_numbers(_text(root / "sys/devices/system/cpu/online"))
+    if required and online and required != online:
         found = f"nvpmodel reports {wanted}, but cores {_listed(online)} are online"
-        return Check(name, Level.FAIL, found, f"cores {_listed(asked)}", "reboot: this mode is taken at start-up only")
+        return Check(name, Level.FAIL, found, f"cores {_listed(required)}", "reboot: a mode applies at start-up only")
     return Check(name, Level.OK, wanted, wanted)
 
 
 def mode_cores(conf: str, mode: str) -> set[int]:
-    """Processor cores that a mode of an nvpmodel configuration has online; empty if it names none."""
+    """Return the online cores of a mode in an nvpmodel configuration; empty if it names none."""
     block = re.search(rf"<\s*POWER_MODEL\s+ID=\d+\s+NAME={re.escape(mode)}\s*>([^<]*)", conf)
     entries = re.findall(r"^\s*CPU_ONLINE\s+CORE_(\d+)\s+([01])\s*$", block[1] if block else "", re.MULTILINE)
     return {int(core) for core, on in entries if on == "1"}
 
 
 def core_numbers(text: str) -> set[int]:
-    """Numbers of a list such as `0-3,6`; empty for anything else."""
+    """Parse a list such as `0-3,6`; empty for any other text."""
     cores: set[int] = set()
     for part in text.split(","):
         found = re.fullmatch(r"(\d{1,4})(?:-(\d{1,4}))?", part.strip())
@@ -91,7 +91,7 @@ def _listed(cores: set[int]) -> str:
 
 
 def cpu_governor(root: Path) -> Check:
-    """How the processor's clock is chosen: one that follows the load makes the first milliseconds of a tick slow."""
+    """Check the processor's frequency governor: one that follows the load slows the first milliseconds of a tick."""
     name = "CPU governor"
     files = sorted((root / "sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor"))
     found = sorted({_text(path) for path in files} - {""})
@@ -104,7 +104,7 @@ def cpu_governor(root: Path) -> Check:
 
 
 def clocks(root: Path) -> Check:
-    """Processor and graphics clocks: what they may reach against what the silicon can, and whether they may fall."""
+    """Check that processor and graphics clocks reach the silicon's maximum and do not fall when idle."""
     name = "clocks"
     parts: list[str] = []
     capped = falling = False
@@ -129,12 +129,12 @@ def clocks(root: Path) -> Check:
     if falling:
         advice = "sudo jetson_clocks, else the first tick after a pause runs at the lowest clock"
         return Check(name, Level.WARN, "; ".join(parts), "a GPU clock that does not fall", advice)
-    # A power mode is such a cap: its name has been checked, the figures are shown.
+    # A power mode is such a limit: another check covers its name, so only show the figures.
     return Check(name, Level.OK, "; ".join(parts), "no cap" if not capped else "the power mode's cap")
 
 
 def match(facts: TargetFacts, providers: Sequence[str], machine: str, available: Sequence[str], root: Path) -> Check:
-    """The machine against the one that the artifacts were made for: processor, execution providers, Jetson Linux."""
+    """Compare processor, execution providers and Jetson Linux with the artifacts' target."""
     name = "target"
     release = l4t_release(_text(root / "etc/nv_tegra_release"))
     found = f"{machine}, {f'L4T {release}' if release else 'no Jetson Linux'}"
@@ -154,25 +154,25 @@ def match(facts: TargetFacts, providers: Sequence[str], machine: str, available:
         advice = "install the ONNX Runtime package that brings it, or export for another target"
         return Check(name, Level.FAIL, f"ONNX Runtime has {', '.join(available)}", ", ".join(providers), advice)
     if size.other:
-        advice = f"the plan was made for {facts.name}: export for this module, with figures of its own"
+        advice = f"the plan was made for {facts.name}: export for this module, with its own figures"
         return Check(name, Level.WARN, found, expected, advice)
     return Check(name, Level.OK, found, expected)
 
 
 @dataclass(frozen=True)
 class _Size:
-    """Cores and memory of the machine beside those of the target."""
+    """Cores and memory of the machine and of the target."""
 
     found: tuple[str, ...]
     expected: str
     less: bool
     other: bool
-    """Another Jetson module, with more of either."""
+    """Whether this is another Jetson module with more cores or memory."""
 
 
 def _size(facts: TargetFacts, root: Path) -> _Size:
-    """What cannot be read is not compared; a card's own memory is not compared with the machine's."""
-    # Those of the silicon: a power mode takes some away, which is another check.
+    """Read both sizes. Unreadable values and a card's own memory are not compared."""
+    # Cores of the silicon: another check covers those that a power mode switches off.
     cores = len(core_numbers(_text(root / "sys/devices/system/cpu/present")))
     total = re.search(r"^MemTotal:\s+(\d+) kB$", _text(root / "proc/meminfo"), re.MULTILINE)
     compatible = _text(root / "proc/device-tree/compatible").split("\0")
@@ -194,7 +194,7 @@ def _version(text: str) -> tuple[int, ...]:
 
 
 def memory(plan: PlanFacts | None, root: Path, *, own_memory: bool = False) -> Check:
-    """Memory that is free now against what the plan takes; `own_memory`: the plan speaks of a graphics card's."""
+    """Check the free memory against the plan; `own_memory`: the plan's memory is a graphics card's own."""
     name = "memory"
     if plan is None:
         return skipped(name, "the artifacts have no plan")
@@ -217,7 +217,7 @@ def memory(plan: PlanFacts | None, root: Path, *, own_memory: bool = False) -> C
 
 
 def disk(folder: Path, usage: Callable[[Path], tuple[int, int]]) -> Check:
-    """Free space where flight logs go; `usage` gives free and total bytes, raising OSError."""
+    """Check the free space for flight logs; `usage` returns free and total bytes and raises OSError."""
     name = "disk"
     try:
         free, total = usage(folder)
@@ -232,12 +232,12 @@ def disk(folder: Path, usage: Callable[[Path], tuple[int, int]]) -> Check:
 
 
 def wall_clock(now: datetime.datetime, not_before: datetime.datetime, root: Path) -> Check:
-    """The clocks: the wall clock dates logs only, so a wrong one warns; control needs a fine monotonic one."""
+    """Check the clocks: a wrong wall clock warns, since it dates logs only; control needs a fine monotonic clock."""
     name = "clock"
     source = _text(root / "sys/devices/system/clocksource/clocksource0/current_clocksource") or "unknown source"
     found = f"{now:%Y-%m-%d %H:%M} UTC, monotonic from {source}"
     if source in _COARSE_CLOCKS:
-        advice = "look in the kernel log for why the processor's own counter is not used"
+        advice = "find in the kernel log why the processor's own counter is not used"
         return Check(name, Level.WARN, found, "a monotonic clock of the processor", advice)
     if now < not_before:
         advice = "set it (timedatectl); flight logs would carry a wrong date, control is not affected"
@@ -260,7 +260,7 @@ def processor_ticks(proc: Path) -> dict[int, tuple[str, int]]:
 def busy_programs(
     before: Mapping[int, tuple[str, int]], after: Mapping[int, tuple[str, int]], elapsed_ticks: float, own: int
 ) -> Check:
-    """Other programs that use the processor, from two readings of `processor_ticks`."""
+    """Check other programs' processor use, from two readings of `processor_ticks`."""
     name = "busy programs"
     if elapsed_ticks <= 0:
         return skipped(name, "no time passed between two readings")

@@ -1,4 +1,4 @@
-"""Checks of what this user may do and read: urgency, memory, devices, the socket's folder, power and temperature."""
+"""Checks of this user's rights: priority, memory, devices, the socket's folder, power and temperature."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ from firmware_bridge.core.config import OPERATOR_SUFFIX, ConfigError
 
 FROM_UNIT = "the service gets it from its unit (edge-install units)"
 SHARED_FOLDER_MODE = 0o711
-"""Of the installed service's folder: the modes of the sockets in it decide."""
+"""Mode of the installed service's folder: the modes of its sockets decide."""
 _SETTLE_S = 0.2
-"""Between opening a meter and reading it: one that counts energy needs some."""
+"""Time between opening a meter and reading it: an energy counter needs some."""
 
 
 @dataclass(frozen=True)
 class UserRights:
-    """A user of this machine: one's own rights can be tried, another user's are read from the modes of files."""
+    """A user of this machine. Own rights can be tried; another user's are read from file modes."""
 
     name: str
     uid: int
     groups: frozenset[int]
     other: bool
-    """Not the user that runs this: nothing can be tried, only read."""
+    """Whether this is another user than that of this process."""
 
     def may(self, path: Path, *, write: bool = False) -> bool:
-        """Whether the user may read (and write) a file: by owner, groups and mode, without access lists for another."""
+        """Return whether the user may read (and write) a file; another user's access lists are ignored."""
         if not self.other:
             return os.access(path, os.R_OK | os.W_OK if write else os.R_OK)
         if self.uid == 0:
@@ -51,12 +51,12 @@ class UserRights:
         except OSError:
             return False
         wanted = stat.S_IROTH | (stat.S_IWOTH if write else 0)
-        # The first class that fits decides, as in the kernel.
+        # The first matching class decides, as in the kernel.
         shift = 6 if found.st_uid == self.uid else 3 if found.st_gid in self.groups else 0
         return (stat.S_IMODE(found.st_mode) >> shift) & wanted == wanted
 
     def through_its_group(self, path: Path) -> bool:
-        """Whether the group of a file may read it, so that membership would do."""
+        """Return whether the group of a file may read it, so that membership would be enough."""
         try:
             return path.stat().st_mode & stat.S_IRGRP != 0
         except OSError:
@@ -64,7 +64,7 @@ class UserRights:
 
 
 def current_user(euid: Callable[[], int] = os.geteuid) -> UserRights:
-    """The user that runs this process."""
+    """Return the user of this process."""
     uid = euid()
     try:
         name = pwd.getpwuid(uid).pw_name
@@ -74,7 +74,7 @@ def current_user(euid: Callable[[], int] = os.geteuid) -> UserRights:
 
 
 def user_named(name: str | None) -> UserRights:
-    """Return that user, by default the one of this process. Raises ConfigError for an unknown user."""
+    """Return the named user, by default that of this process. Raises ConfigError for an unknown user."""
     if name is None:
         return current_user()
     try:
@@ -89,7 +89,7 @@ def user_named(name: str | None) -> UserRights:
 
 
 def try_priority(priority: int) -> list[str]:
-    """Ask for real time in a thread that then ends; lines about what was refused."""
+    """Request real-time priority in a short-lived thread; return lines about refused settings."""
     lines: list[str] = []
     thread = threading.Thread(target=lambda: lines.extend(enter(Role("control", (), priority))))
     thread.start()
@@ -98,7 +98,7 @@ def try_priority(priority: int) -> list[str]:
 
 
 def real_time(priority: int, user: UserRights, attempt: Callable[[int], list[str]] = try_priority) -> Check:
-    """Whether the control thread would get the real-time priority that the target gives it."""
+    """Check whether the control thread can have the target's real-time priority."""
     name = "real-time priority"
     if priority == 0:
         return skipped(name, "the target asks for none")
@@ -110,7 +110,7 @@ def real_time(priority: int, user: UserRights, attempt: Callable[[int], list[str
 
 
 def locked_memory(limit_bytes: int, user: UserRights) -> Check:
-    """Whether the runner may keep its pages in memory."""
+    """Check whether the runner may lock its pages in memory."""
     name = "locked memory"
     if user.other and user.uid != 0:
         return skipped(name, f"cannot be tried for {user.name}; {FROM_UNIT}")
@@ -120,7 +120,7 @@ def locked_memory(limit_bytes: int, user: UserRights) -> Check:
 
 
 def device_access(providers: Sequence[str], root: Path, user: UserRights) -> Check:
-    """Whether the providers' device nodes are there and the user may open them."""
+    """Check whether the providers' device nodes exist and the user may open them."""
     name = "device nodes"
     if not set(providers) & set(NEED_DEVICES):
         return Check(name, Level.OK, "none needed", "those of " + ", ".join(providers))
@@ -140,12 +140,12 @@ def device_access(providers: Sequence[str], root: Path, user: UserRights) -> Che
 
 
 def _is_for_writing(node: Path) -> bool:
-    """Whether not only root may write; /dev/nvmap of an Orin is read-only (NVIDIA/NemoClaw #4231)."""
+    """Return whether users other than root may write; /dev/nvmap of an Orin is read-only (NVIDIA/NemoClaw #4231)."""
     return stat.S_IMODE(node.stat().st_mode) & (stat.S_IWGRP | stat.S_IWOTH) != 0
 
 
 def socket_folder(socket: Path, user: UserRights) -> Check:
-    """That only the robot's users can reach the bridge's sockets: one user alone, or the service's groups."""
+    """Check that only one user, or the service's groups, can reach the bridge's sockets."""
     name = "socket folder"
     folder = socket.parent
     try:
@@ -166,7 +166,7 @@ def socket_folder(socket: Path, user: UserRights) -> Check:
 
 
 def _service_sockets(socket: Path, user: UserRights, bridge_uid: int) -> Check:
-    """Modes and groups of the installed service's two sockets, as the runner meets them."""
+    """Check modes and groups of the installed service's two sockets for the runner."""
     name = "bridge sockets"
     operator = Path(f"{socket}{OPERATOR_SUFFIX}")
     try:
@@ -200,7 +200,7 @@ def power_meter(
     clock: Callable[[], int] = time.monotonic_ns,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Check:
-    """Whether the meter that the target names can be read, and its reading."""
+    """Check that the target's meter can be read, and report its reading."""
     name = "power meter"
     if kind in ("none", "modelled"):
         return skipped(name, f"the target's meter is {kind!r}")
@@ -212,7 +212,7 @@ def power_meter(
         advice = "the governor has nothing to hold the budget by; see the message"
         return Check(name, Level.WARN, str(error), kind, advice)
     found = f"{sample.total_w:.1f} W, {meter.source}, {sample.tagged}"
-    # Of all that a meter reads, only these are commonly closed to everybody but root.
+    # Of all files that meters read, usually only these are restricted to root.
     counters = sorted(sysfs_root.glob(f"{ZONES}/energy_uj")) if user.other and meter.source.startswith("rapl") else []
     if closed := [path for path in counters if not user.may(path)]:
         advice = f"for this boot: sudo chmod a+r {closed[0]}, and the others like it (a side channel, CVE-2020-8694)"
@@ -221,13 +221,13 @@ def power_meter(
 
 
 def temperatures(sysfs_root: Path, now_ns: int) -> Check:
-    """Temperatures, and how far they are from where clocks are held back and where the board switches off."""
+    """Check the temperatures' distance from throttling and from the board's switch-off."""
     name = "temperatures"
     state, limits = ThermalReader(sysfs_root).read(now_ns), LimitsConfig()
     if state.hottest_c is None:
         return skipped(name, "this machine shows no thermal zone")
     found = f"hottest {state.hottest_c:.0f} °C of {len(state.zones_c)} zones"
-    advice = "let it cool down, look at fan and heat sink"
+    advice = "let it cool down, check fan and heat sink"
     trip_c, passive_c = state.trip_margin_c, state.throttle_margin_c
     if trip_c is not None and trip_c <= limits.trip_margin_c:
         found += f", {trip_c:.1f} °C below where the board switches off"

@@ -1,4 +1,4 @@
-"""`edge-replay`: runs the policy again on a flight log and compares what comes out with what was recorded."""
+"""`edge-replay`: runs the policy again on a flight log and compares the outputs with the recorded ones."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ input, 3 refused (artifacts), 130 interrupted
 """
 
 LEAST_SHARE = 0.9
-"""Of the ticks with a plan that must have been run again: agreement of a few proves nothing about the run."""
+"""Required share of replayed ticks with a plan: the agreement of a few proves nothing about the run."""
 _PROGRESS_PERIOD_NS = 2_000_000_000
 
 
@@ -55,7 +55,7 @@ class OptionError(ValueError):
 
 @dataclass(frozen=True)
 class Tolerance:
-    """What may lie between a recorded and a replayed output."""
+    """Largest differences between recorded and replayed outputs."""
 
     trajectory_cm: float
     heading_deg: float
@@ -94,7 +94,7 @@ _print = messages("edge-replay")
 
 
 def replay(path: Path, artifacts: Artifacts, run: RecordedRun, from_s: float, to_s: float) -> tuple[Comparison, int]:
-    """Run a log again: the comparison, and how many ticks it holds; raises RecordingError, ArtifactError, OSError."""
+    """Replay a log; return the comparison and the log's tick count. Raises RecordingError, ArtifactError, OSError."""
     policy, language = Policy(artifacts), LanguageModel(artifacts)
     first_ns = next((event.now_ns for event in read_events(path) if isinstance(event, RecordedTick)), None)
     if first_ns is None:
@@ -117,7 +117,7 @@ def replay(path: Path, artifacts: Artifacts, run: RecordedRun, from_s: float, to
 
 
 def verdict(found: Comparison, tolerance: Tolerance) -> tuple[str, ...]:
-    """What lies beyond the tolerance, one line each; nothing: the outputs agree."""
+    """Return one line per difference beyond the tolerance; empty: the outputs agree."""
     lines: list[str] = []
     for name, unit, values, allowed in (
         ("plan", "cm", found.trajectory_cm, tolerance.trajectory_cm),
@@ -142,7 +142,7 @@ def verdict(found: Comparison, tolerance: Tolerance) -> tuple[str, ...]:
 
 
 def as_result(found: Comparison, ticks: int, beyond: Sequence[str]) -> dict[str, Any]:
-    """The comparison for --json; deviations are None where nothing was compared."""
+    """Return the comparison for --json; deviations are None where nothing was compared."""
 
     def spread(values: list[float]) -> dict[str, float | None]:
         finite = [value if math.isfinite(value) else 1e9 for value in values]  # JSON has no infinity
@@ -174,7 +174,7 @@ def as_result(found: Comparison, ticks: int, beyond: Sequence[str]) -> dict[str,
 
 
 def table(result: dict[str, Any]) -> str:
-    """The result for people."""
+    """Format the result as text."""
     ticks, generations = result["ticks"], result["generations"]
     lines = [
         f"ticks        {ticks['compared']} of {ticks['recorded']} run again, {ticks['equal']} equal bit for bit",
@@ -201,7 +201,7 @@ def table(result: dict[str, Any]) -> str:
 
 
 def _open(args: argparse.Namespace, run: RecordedRun) -> tuple[Artifacts, bool]:
-    """The artifacts, and whether they are those of the run; raises ArtifactError for others without --force."""
+    """Return the artifacts and whether they are the run's; raises ArtifactError for others without --force."""
     artifacts = load_artifacts(args.artifacts.absolute())
     same = artifacts.manifest_sha256 == run.manifest_sha256
     if not same:

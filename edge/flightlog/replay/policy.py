@@ -1,4 +1,4 @@
-"""Run the policy again on the recorded inputs of a flight log, and measure how far its outputs lie apart."""
+"""Runs the policy again on the recorded inputs of a flight log, and measures the deviation of its outputs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from edge.inference.language import ContextOverflowError, LanguageModel
 from edge.inference.policy import Policy
 from edge.motion.controller import TARGET_TIME_S, Controller, ControllerConfig, ControllerInputs
 from edge.motion.recovery import MOVING
-from edge.reasoning.path_memory import Way, way_of
+from edge.reasoning.path_memory import PastPath, past_path_of
 from edge.run.camera import decode_frame
 from edge.state.pose_history import PoseHistory, StampedPose
 from edge.state.reasoning_text import parse_waypoints
@@ -27,20 +27,20 @@ from edge.state.semantic import SemanticState
 from firmware_bridge.core.robot_state import CameraError
 
 FRAMES_KEPT_NS = 120_000_000_000
-"""How long a picture is kept for a generation that names it: its 9 s of past, its own time, and a release delay."""
+"""Time for which a picture is kept for its generation: 9 s of past, the generation's time, a release delay."""
 _ANY_AGE_MS = 1.0
-"""Ages are not judged again: the log has the ticks that were held."""
+"""Limit that disables the check of ages: the log records the ticks that stood."""
 
 Floats = npt.NDArray[np.float32]
 _Result = TypeVar("_Result")
 
 
 _GENERATIONS_KEPT = 3
-"""A tick that was reading the old semantic state while the new one was published comes after it in the log."""
+"""Number of earlier semantic states kept: a tick that read the old state can follow the new one in the log."""
 
 
 class _SkippedError(Exception):
-    """Something that a record refers to is not in the log; the text is the reason."""
+    """The log lacks an input of a record; the message is the reason."""
 
 
 @dataclass
@@ -54,32 +54,32 @@ class _ReplayedGeneration:
 
 @dataclass
 class Comparison:
-    """What was run again, and how far it lies from the log."""
+    """Counts of replayed outputs, and their deviation from the log."""
 
     driven: int = 0
-    """Ticks that had a plan, each of which could be run again if the log held all that it was made from."""
+    """Number of ticks with a plan, each of which a complete log can replay."""
     ticks: int = 0
     ticks_equal: int = 0
-    """Plans that are the same bit for bit."""
+    """Number of plans that are equal bit for bit."""
     generations: int = 0
     texts_equal: int = 0
     different_texts: list[int] = field(default_factory=list)
     """Numbers of the generations whose text differs."""
     poses_interpolated: int = 0
-    """Generations whose frames' poses had to be taken from the ticks around them."""
+    """Number of generations whose frame poses were interpolated from ticks."""
     ways_from_frames: int = 0
-    """Generations of a log without the prompt's path: it is computed from their frames alone."""
+    """Number of generations without a recorded path, which is computed from their frames alone."""
     skipped: Counter[str] = field(default_factory=Counter)
     trajectory_cm: list[float] = field(default_factory=list)
     heading_deg: list[float] = field(default_factory=list)
     command: list[float] = field(default_factory=list)
     """Largest difference of a command's components, in m/s and rad/s."""
     worst_tick: int | None = None
-    """The one whose plan lies farthest apart; None while all are equal."""
+    """The tick with the largest deviation of its plan; None while all are equal."""
 
 
 class Replayer:
-    """Takes a log's events in order; `comparison` is what came of those within [from_ns, to_ns]."""
+    """Replays a log's events in order; `comparison` covers those within [from_ns, to_ns]."""
 
     def __init__(
         self,
@@ -110,7 +110,7 @@ class Replayer:
         self.comparison = Comparison()
 
     def step(self, event: Event) -> None:
-        """Run one event again; what the log lacks for it is counted as skipped."""
+        """Replay one event; count it as skipped when the log lacks an input."""
         if isinstance(event, RecordedFrame):
             self._frames[event.stamp_ns] = event.jpeg
             while next(iter(self._frames)) < event.stamp_ns - FRAMES_KEPT_NS:
@@ -154,7 +154,10 @@ class Replayer:
         ]
         generation = self._language.generate(
             self._language.prompt.build(
-                frames, record.instruction or self._run.instruction, self._way(record, frames), record.context.before
+                frames,
+                record.instruction or self._run.instruction,
+                self._past_path(record, frames),
+                record.context.before,
             ),
             max_new_tokens=record.max_new_tokens,
             cancelled=lambda: False,
@@ -179,11 +182,11 @@ class Replayer:
         )
         return replayed.state
 
-    def _way(self, record: RecordedGeneration, frames: Sequence[EncodedFrame]) -> Way:
-        """The recorded path; of a log without one, the path through the frames alone."""
+    def _past_path(self, record: RecordedGeneration, frames: Sequence[EncodedFrame]) -> PastPath:
+        """Return the recorded path; without one, the path through the frames alone."""
         if record.way is not None:
             return record.way
-        return way_of((frame.stamp_ns, frame.T_odom_base) for frame in frames)
+        return past_path_of((frame.stamp_ns, frame.T_odom_base) for frame in frames)
 
     def _frame_poses(self, record: RecordedGeneration) -> Sequence[SE2]:
         if record.poses is not None:
@@ -192,7 +195,7 @@ class Replayer:
         return [*(pose or record.anchor_pose for pose in poses), record.anchor_pose]
 
     def _act(self, tick: RecordedTick) -> Floats | None:
-        """The whole plan of a tick; None when it had none."""
+        """Return the whole plan of a tick; None when it had none."""
         if tick.rows is None or tick.generation is None or tick.frame_ns is None:
             return None
         if tick.frame_ns not in self._frames:
@@ -215,7 +218,7 @@ class Replayer:
         assert tick.rows is not None
         found = self.comparison
         found.ticks += 1
-        # null in the log stands for whatever is not finite; on one side only, it is infinitely far from the other.
+        # A null in the log means a non-finite number; against a finite one, the deviation is infinite.
         here, there = (np.where(np.isfinite(plan), plan, np.nan) for plan in (rows, tick.rows))
         found.ticks_equal += np.array_equal(here, there, equal_nan=True)
         apart = np.where(np.isnan(here) & np.isnan(there), 0.0, np.nan_to_num(here - there, nan=np.inf))
@@ -229,7 +232,7 @@ class Replayer:
         found.heading_deg.append(float(np.degrees(turn.max())))
 
     def _compare_command(self, tick: RecordedTick, trajectory: Floats | None) -> None:
-        """Run the controller again; its speed is known from the first tick on at which it had to stand."""
+        """Replay the controller; its last command is determined from the first tick with forced standstill on."""
         if self._controller is None:
             return
         hold = None if tick.reason == "ok" else tick.reason

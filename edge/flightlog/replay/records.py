@@ -1,4 +1,4 @@
-"""A flight log as replay needs it: checked records, in the order in which they happened."""
+"""Reads a flight log for replay: checked records, in the order of their stamps."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ import numpy.typing as npt
 from edge.core.geometry import SE2
 from edge.flightlog.reader import RecordingError, jpeg_bytes, read_messages
 from edge.reasoning.decoding_rules import FOLLOWS, FREE, DecodingContext, TurnDistances
-from edge.reasoning.path_memory import Way
+from edge.reasoning.path_memory import PastPath
 from edge.reasoning.prompt import format_before
 from edge.state.reasoning_text import LEFT, PROGRESS_HEAD, RIGHT, Progress, parse_progress
 from firmware_bridge.core.config import ConfigError, LimitsConfig
 
 _ORDER_WINDOW_NS = 5_000_000_000
-"""Threads record at their own pace: how far apart in time neighbouring records of the file may be."""
+"""Largest time by which records of different threads may be out of order in the file."""
 _MISSHAPEN = (LookupError, TypeError, ValueError, AttributeError, OverflowError)
 
 _Parsed = TypeVar("_Parsed")
@@ -30,7 +30,7 @@ Rows = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class RecordedRun:
-    """What the run was: the first record of every log."""
+    """Configuration of the run, from the first record of every log."""
 
     instruction: str
     mode: str
@@ -41,7 +41,7 @@ class RecordedRun:
 
 @dataclass(frozen=True)
 class RecordedFrame:
-    """A camera picture as it came."""
+    """A recorded camera picture."""
 
     stamp_ns: int
     jpeg: bytes
@@ -59,7 +59,7 @@ class RecordedGeneration:
     poses: tuple[SE2, ...] | None
     """`T_odom_base` of each frame; None: a log without poses."""
     anchor_pose: SE2
-    way: Way | None
+    way: PastPath | None
     """The path in the prompt; None: a log from before it was recorded."""
     context: DecodingContext
     max_new_tokens: int
@@ -68,7 +68,7 @@ class RecordedGeneration:
 
 @dataclass(frozen=True)
 class RecordedTick:
-    """What a tick was given and what came of it."""
+    """Inputs and outputs of a tick."""
 
     number: int
     now_ns: int
@@ -91,7 +91,7 @@ Event = RecordedFrame | RecordedGeneration | RecordedTick
 
 
 def read_run(path: Path) -> RecordedRun:
-    """The `/run` record; raises RecordingError when there is none, OSError."""
+    """Read the `/run` record; raises RecordingError without one, OSError."""
     for topic, _, payload in read_messages(path):
         if topic == "/run":
             return _read(path, "/run", _run, payload)
@@ -99,7 +99,7 @@ def read_run(path: Path) -> RecordedRun:
 
 
 def read_events(path: Path) -> Iterator[Event]:
-    """Frames, generations and ticks in the order of their stamps; raises RecordingError for one that is misshapen."""
+    """Yield frames, generations and ticks in the order of their stamps; raises RecordingError for a malformed one."""
     waiting: list[tuple[int, int, Event]] = []
     newest_ns = count = 0
     for topic, stamp_ns, payload in read_messages(path):
@@ -159,7 +159,7 @@ def _generation(payload: Mapping[str, Any]) -> RecordedGeneration:
             _turn(payload.get("turn"), payload.get("turn_left_m")),
             _flag(payload.get("turn_may_be_done", True)),
         ),
-        # Without the cap that was in force: as many as there were, which gives the same keys and values.
+        # Without the recorded cap: use the text's own token count, which gives the same keys and values.
         max_new_tokens=int(payload.get("max_new_tokens", payload["new_tokens"])),
         text=_text(payload["text"]),
     )

@@ -1,5 +1,4 @@
-"""Averages of power in bounded memory, in which each sample weighs as long as it was in force: of the last seconds for
-the budget, and of a whole run for its result."""
+"""Time-weighted averages of power in bounded memory: of the last seconds for the budget, of a run for its result."""
 
 from __future__ import annotations
 
@@ -11,15 +10,15 @@ from typing import Final
 
 BIN_W: Final = 0.05
 BINS: Final = 8192
-"""Up to 409.6 W; what is above shares the last bin."""
+"""Number of bins, up to 409.6 W; larger values share the last bin."""
 _LONGEST_S: Final = 1.0
 
 
 class PowerHistory:
-    """Energy of the last seconds, at any rate of samples, with bounded memory.
+    """Energy of the last seconds, at any sample rate, in bounded memory.
 
-    A sample holds until the next one, but not longer than `hold_s`: a gap beyond that belongs to no sample and is left
-    out of averages. Before the first sample the power is taken to be that of the first sample.
+    A sample applies until the next one, at most for `hold_s`; averages leave out a longer gap. The first sample's power
+    also applies before it.
     """
 
     def __init__(self, keep_s: float, hold_s: float = 1.0, capacity: int = 4096) -> None:
@@ -46,7 +45,7 @@ class PowerHistory:
             self._first_w = None
 
     def energy_j(self, begin_ns: int, end_ns: int) -> tuple[float, float]:
-        """(energy in J, seconds covered by samples) of an interval."""
+        """Return (energy in J, seconds covered by samples) of an interval."""
         if self._newest is None or end_ns <= begin_ns:
             return 0.0, 0.0
         newest_ns, newest_w = self._newest
@@ -64,7 +63,7 @@ class PowerHistory:
         return energy / 1e9, covered / 1e9
 
     def energy_since(self, now_ns: int) -> Callable[[int], float]:
-        """A function of an instant: energy in J from then until now; one pass here, cheap to call often."""
+        """Return a function from an instant to the energy from then until now, J; built in one pass, cheap to call."""
         begins: list[int] = []
         energies: list[float] = []
         powers: list[float] = []
@@ -79,7 +78,7 @@ class PowerHistory:
         before_w = self._first_w or 0.0
 
         def energy_j(since_ns: int) -> float:
-            # `begins` are negative because they go back in time and bisect wants them to grow.
+            # `begins` are negated instants: they go back in time and bisect needs increasing values.
             index = bisect.bisect_left(begins, -since_ns)
             if index == len(begins):
                 first_ns = -begins[-1] if begins else now_ns
@@ -90,7 +89,7 @@ class PowerHistory:
         return energy_j
 
     def average_w(self, now_ns: int, window_s: float) -> float | None:
-        """Mean power of the last `window_s`; None without a sample in it."""
+        """Return the mean power of the last `window_s`, W; None without a sample in it."""
         energy, covered = self.energy_j(now_ns - round(window_s * 1e9), now_ns)
         if covered <= 0:
             return None if self._newest is None else self._newest[1]
@@ -98,7 +97,7 @@ class PowerHistory:
 
 
 class PowerStatistics:
-    """Mean and percentiles of a run: a histogram of power; a sample is in force for at most 1 s."""
+    """Mean and percentiles of a run by a histogram of power; a sample applies for at most 1 s."""
 
     def __init__(self) -> None:
         self._seconds = [0.0] * BINS
@@ -107,7 +106,7 @@ class PowerStatistics:
         self._last: tuple[int, float] | None = None
 
     def add(self, stamp_ns: int, power_w: float) -> None:
-        """The next sample; one that is not newer than the last is dropped."""
+        """Append a sample; one that is not newer than the last is dropped."""
         if self._last is not None:
             last_ns, last_w = self._last
             if stamp_ns <= last_ns:
@@ -120,11 +119,11 @@ class PowerStatistics:
 
     @property
     def mean_w(self) -> float | None:
-        """Mean weighted by time; None before the second sample."""
+        """Return the time-weighted mean, W; None before the second sample."""
         return self._energy_j / self._total_s if self._total_s else None
 
     def percentile_w(self, share: float) -> float | None:
-        """Power that is not exceeded for that share of the time, rounded up to the bin's end."""
+        """Return the power that is not exceeded for that share of the time, W, rounded up to the bin's end."""
         if not self._total_s:
             return None
         seconds, wanted = 0.0, share * self._total_s

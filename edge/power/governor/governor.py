@@ -1,12 +1,12 @@
 """Keeps the moving average of power under a budget by shedding reasoning; control is never slowed.
 
-Steps of shedding: a pause between two generations, as long as the semantic state stays young enough; then fewer new
-tokens (half, a quarter, none: the prompt alone still gives a semantic state); then no reasoning at all.
+Steps of shedding: a pause between two generations, while the semantic state stays young enough; then fewer new tokens
+(half, a quarter, none: the prompt alone still gives a semantic state); then no reasoning at all.
 
-The pause is not felt for by feedback alone, which would swing with the generations: it is computed. The governor learns
-what the device draws with and without reasoning and how long a generation takes, and gives the shortest pause after
-which no window of 10 s would be above the budget, neither in the steady cycle nor with what has just been drawn. An
-integral of what is still above trims the aim. Pure: no clock, no thread, no I/O.
+The pause is computed, because feedback alone would oscillate with the generations. The governor learns the power with
+and without reasoning and the duration of a generation. It gives the shortest pause that keeps every window of 10 s
+below the budget, both in the steady cycle and after the recent draw. An integral of the remaining excess corrects the
+budget that it aims at. Pure: no clock, no thread, no I/O.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from edge.power.meters.meter import is_power
 from edge.reasoning.generation_cycle import UNLIMITED, ReasoningBudget
 
 LEVELS: Final = ("full", "half", "quarter", "prompt", "off")
-"""Names of the steps; the pause is part of each but the last."""
+"""Names of the steps; each but the last includes the pause."""
 OFF: Final = len(LEVELS) - 1
 _SHARES: Final = (1.0, 0.5, 0.25, 0.0)
 _WORSE_S: Final = 3.0
-"""A step further is taken after a pause has been too long for this time."""
+"""Time with a too long pause after which the governor takes the next step."""
 _BETTER_S: Final = 15.0
-"""A step back, after the shorter pause would have done for this time."""
+"""Time with a sufficient shorter pause after which the governor takes a step back."""
 _BETTER_SHARE: Final = 0.7
-"""... and would have been this share of the longest: otherwise it would be taken forth and back."""
+"""Largest share of the longest pause at which it takes a step back, to prevent oscillation."""
 _OFF_MARGIN: Final = 0.97
 _LOST_S: Final = 1.0
 _TRIM_PER_S: Final = 0.05
@@ -44,13 +44,13 @@ _COARSE_S, _FINE_S = 0.5, 0.1
 
 @dataclass(frozen=True)
 class GovernorConfig:
-    """What is to be kept, and what is known before anything was measured."""
+    """The budget, and the values from before the first measurement."""
 
     budget_w: float | None
-    """None: nothing to keep but heat and battery."""
+    """None: only heat and battery limit reasoning."""
     max_new_tokens: int
     max_delay_s: float = math.inf
-    """Age that a semantic state may reach; pauses that would make it older become token caps."""
+    """Largest age of a semantic state, s; pauses that would exceed it become token caps."""
     model: PowerModel | None = None
     window_s: float = 10.0
     limits: LimitsConfig = field(default_factory=LimitsConfig)
@@ -64,14 +64,14 @@ class GovernorConfig:
 
 @dataclass(frozen=True)
 class GovernorInputs:
-    """What is known now; None for what is not."""
+    """Inputs of one step; None for an unknown value."""
 
     power_w: float | None
     """The meter's newest reading; None without a fresh one."""
     reasoning: bool
     """A generation is under way."""
     reasoning_s: float
-    """Time that generations have taken so far; it only grows."""
+    """Total time of generations so far, s; it only grows."""
     generations: int
     """Generations finished so far."""
     throttled: bool = False
@@ -79,23 +79,23 @@ class GovernorInputs:
     trip_margin_c: float | None = None
     battery_percent: float | None = None
     abandoned: int = 0
-    """Generations begun and not finished so far; the time that they took is in `reasoning_s` too."""
+    """Generations begun and not finished so far; `reasoning_s` includes their time."""
 
 
 @dataclass(frozen=True)
 class GovernorOutputs:
-    """What reasoning may do, and what the operator should know."""
+    """The budget of reasoning, and the state for the operator."""
 
     budget: ReasoningBudget = UNLIMITED
     average_w: float | None = None
     """Moving average over the window, metered or modelled."""
     budget_w: float | None = None
-    """What is kept now; a low battery lowers it."""
+    """The present budget, W; a low battery lowers it."""
     level: str = LEVELS[0]
     metered: bool = False
-    """False: the meter gives nothing and the model stands in for it."""
+    """False: the meter gives no sample and the model replaces it."""
     over_budget: bool = False
-    """Reasoning is off and the rest alone is above the budget."""
+    """Whether reasoning is off and the remaining power alone exceeds the budget."""
     findings: tuple[str, ...] = ()
     """Names of the fault table."""
     message: str | None = None
@@ -103,7 +103,7 @@ class GovernorOutputs:
 
 
 class Governor:
-    """See the module; one caller, `now_ns` may not go back."""
+    """The governor (see the module); one thread calls it, and `now_ns` must not decrease."""
 
     def __init__(self, config: GovernorConfig) -> None:
         self._config = config
@@ -128,7 +128,7 @@ class Governor:
         self._reported: tuple[int, bool, bool, tuple[str, ...]] = (0, True, False, ())
 
     def step(self, inputs: GovernorInputs, now_ns: int) -> GovernorOutputs:
-        """One step, about ten times a second; any rate and any gap will do."""
+        """Run one step, about ten times a second; any rate and any gap is allowed."""
         config = self._config
         self._learn(inputs, now_ns)
         metered = self._metered_ns is not None and now_ns - self._metered_ns <= _LOST_S * 1e9
@@ -170,7 +170,7 @@ class Governor:
         )
 
     def _learn(self, inputs: GovernorInputs, now_ns: int) -> None:
-        """Take the sample, or what it should have been, into the history; learn levels and lengths."""
+        """Append the sample, or its modelled value, to the history; learn levels and durations."""
         share, dt_s = float(inputs.reasoning), 0.0
         if self._metered_ns is None:
             self._metered_ns = now_ns  # a meter that has just been opened may take its time
@@ -197,7 +197,7 @@ class Governor:
             self._history.add(now_ns, levels.at(share))
 
     def _aim(self, budget_w: float, average_w: float | None, now_ns: int) -> float:
-        """The budget less what the computed pause has lacked so far."""
+        """Return the budget less the integral of the excess so far, W."""
         dt_s = 0.0 if self._last is None else min(1.0, (now_ns - self._last[0]) / 1e9)
         over_w = 0.0 if average_w is None else max(0.0, average_w - budget_w)
         self._trim_w += (over_w * _TRIM_PER_S - self._trim_w / _TRIM_FORGET_S) * dt_s
@@ -205,7 +205,7 @@ class Governor:
         return budget_w - self._trim_w
 
     def _generation_s(self, level: int) -> float | None:
-        """Length of a generation at a level: measured there, else scaled from another or planned; None if unknown."""
+        """Return a generation's duration at a level, s: measured, scaled from another, or planned; else None."""
         cap, model = min(level, OFF - 1), self._config.model
         measured = self._times.nearest(cap)
         if measured is None:
@@ -219,7 +219,7 @@ class Governor:
         return round(self._config.max_new_tokens * _SHARES[min(level, OFF - 1)])
 
     def _steady_pause(self, levels: Levels, aim_w: float, level: int) -> float:
-        """Pause of an even cycle of generations whose worst window meets the aim."""
+        """Return the pause of a steady cycle of generations whose worst window meets the aim, s."""
         generation_s = self._generation_s(level)
         if levels.at(1.0) <= aim_w:
             return 0.0
@@ -230,7 +230,7 @@ class Governor:
         return pause_for((aim_w - levels.base_w) / levels.rise_w, generation_s, self._config.window_s)
 
     def _pause_after_now(self, levels: Levels, aim_w: float, inputs: GovernorInputs, now_ns: int) -> float:
-        """Pause since the last generation's end after which one more, with all that was drawn before, meets the aim."""
+        """Return the pause after the last generation with which the next one meets the aim, s."""
         longest, mean_s = self._times.longest_s(min(self._level, OFF - 1)), self._generation_s(self._level)
         if levels.at(1.0) <= aim_w or mean_s is None:
             return 0.0
@@ -253,7 +253,7 @@ class Governor:
         return (now_ns - ended_ns) / 1e9 + wait_s if wait_s > 0 else 0.0
 
     def _longest_pause(self, level: int) -> float:
-        """Pause after which the state in use would be at its age limit: Δt is at most two generations and a pause."""
+        """Return the pause at the age limit of the state, s: Δt is at most two generations and a pause."""
         if level >= OFF - 1 or not math.isfinite(self._config.max_delay_s):
             return _LONGEST_PAUSE_S
         return max(0.0, self._config.max_delay_s - 2 * (self._generation_s(level) or 0.0))
@@ -309,7 +309,7 @@ class Governor:
 
 
 def _first(fits: Callable[[float], bool], most_s: float) -> float:
-    """Shortest wait that fits, to a tenth of a second; `most_s` if none does."""
+    """Return the shortest wait that meets the aim, to 0.1 s; `most_s` if none does."""
     wait_s = 0.0
     while wait_s < most_s and not fits(wait_s):
         wait_s += _COARSE_S

@@ -1,4 +1,4 @@
-"""Learns, from power and from how much reasoning ran, what the device draws with and without it."""
+"""Learns the device's power with and without reasoning, from metered power and the share of reasoning."""
 
 from __future__ import annotations
 
@@ -7,25 +7,25 @@ from collections import deque
 from dataclasses import dataclass
 
 SMOOTH_S = 2.0
-"""Time constant by which power and what ran are both smoothed before they are compared."""
+"""Time constant with which power and reasoning share are smoothed before the comparison."""
 LEARN_S = 4.0
 """Time constant: a few times the period of the samples, shorter than a generation."""
 
 
 @dataclass(frozen=True)
 class Levels:
-    """Power without reasoning, and what a running generation adds."""
+    """Power without reasoning, and the additional power of a running generation, W."""
 
     base_w: float
     rise_w: float
 
     def at(self, share: float) -> float:
-        """Power with reasoning running that share of the time."""
+        """Return the power with that share of reasoning, W."""
         return self.base_w + self.rise_w * share
 
 
 class LevelEstimator:
-    """Two levels by normalised least mean squares: each sample moves the level that it depends on."""
+    """Estimator of both levels by normalised least mean squares: a sample updates the level that it depends on."""
 
     def __init__(self, start: Levels | None) -> None:
         self._start = start
@@ -35,15 +35,15 @@ class LevelEstimator:
 
     @property
     def levels(self) -> Levels | None:
-        """What is known; None before the first sample without a model to start from."""
+        """The estimate; None before the first sample without an initial model."""
         return None if self._base_w is None else Levels(self._base_w, self._rise_w or 0.0)
 
     def add(self, power_w: float, share: float, dt_s: float) -> None:
-        """A sample during which reasoning ran `share` (0 to 1) of the time."""
+        """Take a sample during which reasoning ran `share` (0 to 1) of the time."""
         if self._base_w is None:
             self._base_w = power_w
         if self._smooth is not None:
-            # A meter that averages over a second is late; as late as this, what ran is compared with what it shows.
+            # A meter that averages over a second is late: delay the reasoning share equally before the comparison.
             keep = math.exp(-dt_s / SMOOTH_S)
             power_w += (self._smooth[0] - power_w) * keep
             share += (self._smooth[1] - share) * keep
@@ -58,13 +58,13 @@ class LevelEstimator:
         step = error * (1 - math.exp(-dt_s / LEARN_S)) / ((1 - share) ** 2 + share**2)
         busy_w += step * share
         if share < 0.02:
-            busy_w += step  # what changes without reasoning changes under it too
+            busy_w += step  # a change of idle power applies during reasoning too
         self._base_w += step * (1 - share)
         self._rise_w = max(0.0, busy_w - self._base_w)
 
 
 class GenerationTimes:
-    """How long generations take under each token cap, from counts of busy time and of finished generations."""
+    """Durations of generations under each token cap, from counts of busy time and finished generations."""
 
     KEEP = 4
 
@@ -77,7 +77,7 @@ class GenerationTimes:
     def update(self, generations: int, busy_s: float, cap: int, abandoned: int = 0) -> None:
         """Counts so far, which only grow, and the cap under which the last generation was started.
 
-        `abandoned`: generations that were begun and not finished; their time is no length of one.
+        `abandoned`: generations that were begun and not finished; their time is not a generation's duration.
         """
         if abandoned > self._abandoned and generations == self._done:
             self._busy_s = busy_s
@@ -88,11 +88,11 @@ class GenerationTimes:
             self._done, self._busy_s = generations, busy_s
 
     def longest_s(self, cap: int) -> float | None:
-        """Longest of the last few under that cap; None before the first."""
+        """Return the longest of the last few durations under that cap, s; None before the first."""
         return max(self._recent[cap], default=None)
 
     def nearest(self, cap: int) -> tuple[int, float] | None:
-        """The cap nearest to it that was measured, and its mean; None if none was."""
+        """Return the nearest measured cap and its mean duration, s; None without any."""
         known = [(abs(other - cap), other) for other in range(len(self._recent)) if self._recent[other]]
         if not known:
             return None
@@ -101,7 +101,7 @@ class GenerationTimes:
 
 
 def worst_share(generation_s: float, pause_s: float, window_s: float) -> float:
-    """Largest share of any window that generations take which repeat after a pause."""
+    """Return the largest share of a window in generations that repeat after a pause."""
     cycle_s = generation_s + pause_s
     if cycle_s <= 0:
         return 1.0
@@ -110,7 +110,7 @@ def worst_share(generation_s: float, pause_s: float, window_s: float) -> float:
 
 
 def pause_for(share: float, generation_s: float, window_s: float, tolerance_s: float = 0.01) -> float:
-    """Shortest pause that keeps every window's share at or below `share`; infinite where none does."""
+    """Return the shortest pause that keeps every window's share at or below `share`, s; infinite where none does."""
     if share >= 1.0:
         return 0.0
     if share <= 0.0 or generation_s >= share * window_s:

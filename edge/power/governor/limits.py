@@ -1,4 +1,4 @@
-"""What heat and the battery demand of reasoning, whatever the budget would allow; pure."""
+"""Limits of reasoning by heat and battery, apart from the power budget; pure."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ class LimitsConfig:
     throttle_clear_c: float = 3.0
     """Degrees below the passive trip at which throttling is over."""
     trip_margin_c: float = 3.0
-    """Degrees below the critical trip at which the board is taken to be about to switch off."""
+    """Degrees below the critical trip at which the board counts as about to switch off."""
     trip_clear_c: float = 8.0
     clear_s: float = 10.0
-    """How long it must have been cool."""
+    """Time for which the board must have been cool, s."""
     worsen_s: float = 20.0
-    """Heat that lasts this long takes the next step."""
+    """Duration of heat after which the next step is taken, s."""
     low_percent: float = 20.0
     empty_percent: float = 10.0
     battery_clear_percent: float = 2.0
     low_budget: float = 0.8
-    """Share of the budget that a low battery leaves."""
+    """Share of the budget at a low battery."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -34,10 +34,10 @@ class LimitsConfig:
 
 
 class HeatAndBattery:
-    """Keeps what was found until it is over: a value that is missing changes nothing."""
+    """Keeps heat and battery states until they end; a missing value changes nothing."""
 
     def __init__(self, config: LimitsConfig, steps: int) -> None:
-        """`steps` is how many steps of shedding there are; the last is reasoning off."""
+        """`steps`: number of shedding steps; the last is reasoning off."""
         self._config = config
         self._last_step = steps
         self._hot_ns: int | None = None
@@ -48,7 +48,7 @@ class HeatAndBattery:
 
     @property
     def findings(self) -> tuple[str, ...]:
-        """Names of the fault table for what is there now."""
+        """Names of the active faults."""
         found = (
             ("thermal-trip", self._tripped),
             ("thermal-throttle", self._hot_ns is not None),
@@ -59,7 +59,7 @@ class HeatAndBattery:
 
     @property
     def budget_share(self) -> float:
-        """What is left of the budget."""
+        """Return the share of the budget that the battery leaves."""
         return self._config.low_budget if self._low else 1.0
 
     def update(
@@ -71,7 +71,7 @@ class HeatAndBattery:
         trip_margin_c: float | None,
         battery_percent: float | None,
     ) -> int:
-        """The least step of shedding that heat and battery demand: 0 none, the last one reasoning off."""
+        """Return the smallest shedding step that heat and battery require: 0 none, the last one reasoning off."""
         config = self._config
         if trip_margin_c is not None and math.isfinite(trip_margin_c):
             limit_c = config.trip_clear_c if self._tripped else config.trip_margin_c

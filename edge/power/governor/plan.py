@@ -12,12 +12,12 @@ from edge.artifacts.manifest import Artifacts
 from edge.power.meters.meter import MEASURED, MODELLED
 
 STAGES: Final = ("vision_encoder", "action_expert", "prefill", "decode", "semantic_context")
-"""Their units: calls, calls, whole prompts, new tokens, calls."""
+"""Units of their counts: calls, calls, whole prompts, new tokens, calls."""
 
 
 @dataclass(frozen=True)
 class PowerModel:
-    """Energy above idle of a tick and of the parts of a generation, and how long a generation takes beside control."""
+    """Energy above idle of a tick and of a generation's parts, and a generation's duration beside control."""
 
     idle_w: float
     period_s: float
@@ -29,7 +29,7 @@ class PowerModel:
     """One new token."""
     context_j: float
     before_text_s: float
-    """A generation without any new token: prefill and semantic context."""
+    """Duration of a generation without new tokens, s: prefill and semantic context."""
     token_s: float
     tagged: str = MODELLED
 
@@ -44,25 +44,25 @@ class PowerModel:
 
     @property
     def control_w(self) -> float:
-        """What control adds to idle power."""
+        """Return the additional power of control above idle, W."""
         return (self.encode_j + self.act_j) / self.period_s
 
     def generation_s(self, tokens: int) -> float:
-        """Duration of a generation of that many new tokens, beside control."""
+        """Return a generation's duration with that many new tokens, beside control, s."""
         return self.before_text_s + self.token_s * tokens
 
     def generation_j(self, tokens: int) -> float:
-        """Its energy above idle."""
+        """Return its energy above idle, J."""
         return self.prefill_j + self.context_j + self.token_j * tokens
 
     def reasoning_w(self, tokens: int) -> float:
-        """What a running generation adds to idle power and control."""
+        """Return the additional power of a running generation above idle and control, W."""
         return self.generation_j(tokens) / self.generation_s(tokens)
 
 
 @dataclass(frozen=True)
 class PowerPlan:
-    """How the target wants its power measured and limited."""
+    """The target's power measurement and limit."""
 
     meter: str
     rail: str | None
@@ -70,11 +70,11 @@ class PowerPlan:
     max_delay_s: float
     max_new_tokens: int
     model: PowerModel | None
-    """None: the target has no figures of power."""
+    """None: the target has no power figures."""
 
 
 def read_power_plan(artifacts: Artifacts) -> PowerPlan:
-    """The power plan of verified artifacts; raises ArtifactError."""
+    """Read the power plan of verified artifacts; raises ArtifactError."""
     manifest = read_manifest(artifacts.directory)
     if manifest[SEAL] != artifacts.manifest_sha256:
         raise ArtifactError(f"{artifacts.directory / MANIFEST_NAME}: changed while it was being opened; start again")
@@ -82,7 +82,7 @@ def read_power_plan(artifacts: Artifacts) -> PowerPlan:
 
 
 def power_plan(manifest: Mapping[str, Any], max_new_tokens: int) -> PowerPlan:
-    """The same from a manifest's `plan` and its target's `power`; raises ArtifactError."""
+    """Build the power plan from a manifest's `plan` and its target's `power`; raises ArtifactError."""
     try:
         plan = manifest["plan"]
         target = manifest["provenance"].get("target", {})
@@ -106,7 +106,7 @@ def _model(plan: Mapping[str, Any], power: Mapping[str, Any]) -> PowerModel | No
         return None
     joules = {name: float(stages[name]["energy_j"]) for name in STAGES}
     seconds = {name: float(stages[name]["ms"]) / 1e3 for name in STAGES}
-    # Beside control a generation takes longer than by itself, its parts alike.
+    # Control slows all parts of a generation equally.
     alone_ms, beside_ms = float(plan["generation_alone_ms"]), plan["generation_ms"]
     slower = 1.0 if beside_ms is None else float(beside_ms) / alone_ms
     tokens = int(stages["decode"]["calls"])

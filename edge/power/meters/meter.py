@@ -1,4 +1,4 @@
-"""One reading of a power meter, what every meter offers, and the meter that computes power from the plan instead."""
+"""A power reading, the interface of all meters, and the meter that computes power from the plan."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Final, Protocol
 MEASURED: Final = "measured"
 MODELLED: Final = "modelled"
 MOST_W: Final = 2000.0
-"""Above it a reading is a fault of the meter: no device that this program runs on takes as much."""
+"""Largest plausible reading, W: no supported device draws more."""
 
 
 class MeterError(RuntimeError):
-    """A meter that is not there or cannot be read; its text is the one line to show."""
+    """A missing or unreadable meter; the message is one line."""
 
 
 @dataclass(frozen=True)
@@ -25,10 +25,10 @@ class PowerSample:
     """Monotonic time of the reading."""
     total_w: float
     rails: Mapping[str, float] = field(default_factory=dict)
-    """Every rail that was read; they need not add up to the total, since rails may feed one another."""
+    """Power of every rail; rails may feed one another, so the sum can differ from the total."""
     tagged: str = MEASURED
     source: str = ""
-    """Which meter, and what its total covers."""
+    """Meter, and the coverage of its total."""
 
     def __post_init__(self) -> None:
         if not is_power(self.total_w):
@@ -37,27 +37,27 @@ class PowerSample:
 
 
 class PowerMeter(Protocol):
-    """Reads power; may be slow and may fail, so it is only read from a thread of its own."""
+    """A power meter; reading may be slow and may fail, so only a separate thread reads it."""
 
     @property
     def source(self) -> str:
-        """Which meter, and what its total covers."""
+        """Meter, and the coverage of its total."""
 
     @property
     def caveat(self) -> str | None:
-        """What the total leaves out, in one line; None: nothing that is known."""
+        """Consumers outside the total, in one line; None: no known ones."""
 
     def read(self, now_ns: int) -> PowerSample:
-        """One sample; raises MeterError."""
+        """Read one sample; raises MeterError."""
 
 
 def is_power(value: float) -> bool:
-    """Whether a meter can have read this many W: finite, not negative, at most `MOST_W`."""
+    """Return whether a reading in W is plausible: finite, not negative, at most `MOST_W`."""
     return math.isfinite(value) and 0.0 <= value <= MOST_W
 
 
 class BatteryReading(Protocol):
-    """What a robot reports of its battery; None for what it does not report."""
+    """A robot's battery report; None for a value that it does not report."""
 
     @property
     def received_ns(self) -> int:
@@ -72,20 +72,20 @@ ReadBattery = Callable[[], BatteryReading | None]
 
 
 class ModelledMeter:
-    """Idle power and the energy of what has run since the last reading, by the plan's figures."""
+    """Meter that computes idle power plus the energy since the last reading from the plan's figures."""
 
     source = "the plan's model"
     caveat: str | None = "not a measurement"
 
     def __init__(self, idle_w: float, energy_j: Callable[[], float]) -> None:
-        """`energy_j()` is the modelled energy above idle of everything that has run so far."""
+        """`energy_j()` returns the modelled energy above idle so far, J."""
         self._idle_w = idle_w
         self._energy_j = energy_j
         self._last: tuple[int, float] | None = None
         self._power_w = idle_w
 
     def read(self, now_ns: int) -> PowerSample:
-        """Mean power since the previous reading; raises MeterError when the model gives no power."""
+        """Return the mean power since the previous reading; raises MeterError when the model gives no power."""
         energy_j = self._energy_j()
         if self._last is not None and now_ns > self._last[0]:
             self._power_w = self._idle_w + (energy_j - self._last[1]) * 1e9 / (now_ns - self._last[0])

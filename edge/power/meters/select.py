@@ -1,4 +1,4 @@
-"""Which meter a device has, by the name that its target gives or by looking for one."""
+"""Selects a device's meter by its target's name for it, or by search."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ def open_meter(
     nvml: Any = None,
     now_ns: int | None = None,
 ) -> PowerMeter:
-    """The meter of that kind; `auto` takes the first that this device has.
+    """Open the meter of that kind; `auto` opens the first that this device has.
 
     `rail` is the INA3221's total; `idle_w` and `energy_j` are the model's (for `modelled`, and the last resort of
-    `auto`); `nvml` stands in for the module pynvml. Raises MeterError that names what was looked for.
+    `auto`); `nvml` replaces the module pynvml. Raises MeterError that names the missing files.
     """
     if kind == "ina3221":
         return Ina3221Meter.open(sysfs_root, rail)

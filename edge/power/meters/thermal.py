@@ -1,7 +1,7 @@
-"""Temperatures, and whether the machine holds its clocks back because of them or because of over-current.
+"""Reads temperatures, and whether heat or over-current throttles the machine's clocks.
 
-Zones are found by `type`, because numbers differ between boards and releases. Distances to the board's own trip points
-matter, not degrees: `passive` is where Linux starts to slow down, `critical` is where it cuts the power.
+Zones are found by `type`, because numbers differ between boards and releases. The relevant values are distances to the
+board's trip points: at `passive` Linux begins to throttle, at `critical` it cuts the power.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from typing import Final
 from edge.core.sysfs import SYSFS, hwmon_named, read_int, read_text
 
 JUNCTION: Final = ("tj-thermal", "tj-therm", "Tj-therm")
-"""Jetson's hottest point, as its own zone; on some carrier boards it is there and reads as nothing."""
+"""Zone of Jetson's hottest point; on some carrier boards it exists without a reading."""
 LOWEST_C, HIGHEST_C = -40.0, 150.0
 """A disabled Jetson zone reads -256 °C."""
 LOWEST_TRIP_C: Final = 50.0
-"""A passive trip below it is a user's trip that is not set."""
+"""Passive trips below this are unset user trips."""
 WARNS_ONLY: Final = "hot-surface-alert"
-"""Jetson's cooling device that says "do not touch" from a passive trip at 70 °C on, and slows nothing down."""
-# A fan that turns is no throttling, and some boards cap devfreq at rest.
+"""Jetson's cooling device that warns of a hot surface from 70 °C on and throttles nothing."""
+# A running fan is no throttling, and some boards cap devfreq at rest.
 _THROTTLES = re.compile(r"(.*-throttle-alert|Processor|(thermal-)?cpufreq-(cpu)?\d+)")
 EVENTS: Final = ("oc1", "oc2", "oc3")
 """Counters of under-voltage, average over-current and instantaneous over-current."""
@@ -31,7 +31,7 @@ _EVENT_FOLDERS = "devices/platform/**/soctherm-oc-event/hwmon/hwmon*"
 
 @dataclass(frozen=True)
 class ThermalState:
-    """One reading; None for what the board does not report."""
+    """One reading; None for a value that the board does not report."""
 
     stamp_ns: int
     zones_c: Mapping[str, float] = field(default_factory=dict)
@@ -41,11 +41,11 @@ class ThermalState:
     trip_margin_c: float | None = None
     """Degrees below the nearest critical trip point."""
     throttling: tuple[str, ...] = ()
-    """What holds clocks back now."""
+    """Present causes of throttling."""
 
     @property
     def throttled(self) -> bool:
-        """Clocks are held back now."""
+        """Whether clocks are throttled now."""
         return bool(self.throttling)
 
 
@@ -73,7 +73,7 @@ class ThermalReader:
         self._counts = {path: read_int(path) for path in self._counters}
 
     def read(self, now_ns: int) -> ThermalState:
-        """One reading; what cannot be read is left out, nothing is raised."""
+        """Return one reading without the unreadable values; never raises."""
         zones: dict[str, float] = {}
         throttle_c: list[float] = []
         trip_c: list[float] = []
@@ -121,16 +121,15 @@ def _zone(path: Path) -> _Zone | None:
 
 
 def _bound(zone: Path, trip: str) -> set[str]:
-    """Types of the cooling devices that a zone's trip point acts on."""
+    """Return the types of the cooling devices that a zone's trip point controls."""
     files = [path for path in zone.glob("cdev*_trip_point") if read_text(path) == trip]
     return {name for path in files if (name := read_text(zone / path.name.partition("_")[0] / "type")) is not None}
 
 
 class OverCurrentEvents:
-    """Over-current and under-voltage events that a Jetson has throttled for, since this object was made.
+    """Count of over-current and under-voltage events that throttled a Jetson since this object's creation.
 
-    The hardware counts since boot, and one event of thousands is no fault: what matters is how many a run has added.
-    Empty on boards without such counters.
+    The hardware counts since boot; only the events of this run matter. Empty on boards without such counters.
     """
 
     def __init__(self, sysfs_root: Path = SYSFS) -> None:
@@ -140,7 +139,7 @@ class OverCurrentEvents:
         self._events = dict.fromkeys(self._last, 0)
 
     def read(self) -> dict[str, int]:
-        """Events so far by counter; a counter that went back was reset and counts from zero."""
+        """Return the events so far by counter; a counter that decreased was reset and counts from zero."""
         for name, last in self._last.items():
             count = read_int(self._files[name])
             if count is not None:

@@ -1,4 +1,4 @@
-"""Findings: what a monitor has seen now; and the queue by which other threads hand theirs to the control thread."""
+"""Findings of the monitors, and the queue that brings other threads' findings to the control thread."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from edge.safety.faults.table import FAULTS
 
 @dataclass(frozen=True)
 class Finding:
-    """A fault of the table, seen in one step. It is given again in every step as long as it is there."""
+    """A fault of the table, found in one step. A monitor reports it again in every step while it lasts."""
 
     name: str
     detail: str = ""
-    """Numbers for the operator: what was found and what was expected."""
+    """Found and expected values, for the operator."""
     speed_scale: float | None = None
-    """A limit that depends on how bad it is; None: the table's."""
+    """Share of the speed limit where it depends on the severity; None: the table's."""
 
     def __post_init__(self) -> None:
         if self.name not in FAULTS:
@@ -28,7 +28,7 @@ class Finding:
 class FindingQueue:
     """Findings of other threads (odometry, power), kept until the control thread takes them.
 
-    No thread waits: appending to and taking from a deque are atomic in CPython. A full queue forgets its oldest entry.
+    No thread waits: appending to and taking from a deque are atomic in CPython. A full queue drops its oldest entry.
     """
 
     def __init__(self, capacity: int = 256) -> None:
@@ -42,9 +42,9 @@ class FindingQueue:
         return len(self._queue)
 
     def take(self) -> tuple[Finding, ...]:
-        """Everything since the last call, oldest first; control thread only."""
+        """Return all findings since the last call, oldest first; control thread only."""
         taken: list[Finding] = []
-        # No more than fit in the queue: a thread that adds without end must not hold the control thread up.
+        # At most one queue length: a thread that adds without end must not delay the control thread.
         for _ in range(len(self._queue)):
             taken.append(self._queue.popleft())
         return tuple(taken)

@@ -9,16 +9,16 @@ from types import MappingProxyType
 
 
 class Action(Enum):
-    """What a fault does to the robot, from least to most."""
+    """Action of a fault, from least to most severe."""
 
     NOTHING = "nothing"
-    """Control must not change at all: what came is dropped or counted."""
+    """Control does not change: the input is dropped or counted."""
     LIMIT = "limit"
-    """The speed limit is lowered; the arc is kept."""
+    """Lower speed limit on the same arc."""
     ZERO = "zero"
-    """Zero velocity until the fault has been gone for its clear time."""
+    """Zero velocity until the fault has been absent for its clear time."""
     STOP = "stop"
-    """Zero velocity, latched: only a new arming ends it."""
+    """Latched zero velocity: only a new arming ends it."""
 
 
 PLACES = ("runner", "bridge", "robot", "start")
@@ -46,17 +46,17 @@ class Fault:
     """Row of the fault matrix."""
     action: Action
     bound_ms: int
-    """From the fault's effect at our input to zero (or limited) velocity on the wire; 0: it never moves at all."""
+    """Longest time from the fault's effect at our input to its velocity on the wire, ms; 0: the robot never moves."""
     where: str
-    """What acts: the runner, the bridge, the robot itself, or the start-up checks, which refuse to arm."""
+    """The acting part: the runner, the bridge, the robot itself, or the start-up checks, which refuse to arm."""
     message: str
-    """What is wrong, one sentence for the operator."""
+    """The failure, one sentence for the operator."""
     advice: str
-    """What to do next, one sentence."""
+    """The next step, one sentence for the operator."""
     test_id: str
-    """pytest node id of the test that injects it."""
+    """pytest node id of the test that injects the fault."""
     clear_ms: int = 1000
-    """An unlatched fault ends when it has not been found for this long."""
+    """Time without the fault after which an unlatched fault ends."""
     speed_scale: float = 1.0
     """A limit's share of the speed limit; 1 keeps the speed and only shows the message."""
     escalation: Escalation | None = None
@@ -83,7 +83,7 @@ LAST_ROW = 64
 
 
 def table(*groups: tuple[Fault, ...]) -> Mapping[str, Fault]:
-    """Faults by name; raises ValueError for a name given twice or an escalation to an unknown name."""
+    """Return the faults by name; raises ValueError for a duplicate name or an escalation to an unknown name."""
     rows: dict[str, Fault] = {}
     for fault in (fault for group in groups for fault in group):
         if fault.name in rows:

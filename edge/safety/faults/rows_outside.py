@@ -1,4 +1,4 @@
-"""Faults that the bridge or the robot answers, because the runner is what has failed, and those that refuse a start."""
+"""Faults that the bridge or the robot handles because the runner has failed, and faults that refuse a start."""
 
 from __future__ import annotations
 
@@ -11,43 +11,43 @@ BRIDGE: tuple[Fault, ...] = (
     Fault(
         "commands-late", 22, Action.STOP, 300, "bridge",
         "The bridge got no good command in time.",
-        "Something else uses the processor: edge-doctor says what; then arm again.",
+        "Another program uses the processor: edge-doctor names it; then arm again.",
         "tests/firmware_bridge/test_bridge_core.py::TestDeadman::test_the_wire_is_zero_when_the_last_good_command_is_250_ms_old",
     ),
     Fault(
         "graph-hung", 23, Action.STOP, 300, "bridge",
-        "A graph's run does not come back (driver or GPU hang): no commands come.",
-        "The watchdog restarts the runner; look at the kernel log before arming again.",
+        "A graph's run does not return (driver or GPU hang): no commands arrive.",
+        "The watchdog restarts the runner; check the kernel log before arming again.",
         "tests/process/bridge/test_bridge_process.py::test_a_dead_or_frozen_runner_leaves_zero_on_the_wire",
     ),
     Fault(
         "out-of-memory", 26, Action.STOP, 300, "bridge",
         "The machine ran out of memory and the runner was killed.",
-        "Look for what used the memory (edge-doctor), then arm again.",
+        "Find the program that used the memory (edge-doctor), then arm again.",
         "tests/process/test_edge_run.py::test_killed_while_driving_the_robot_gets_zero_within_300_ms",
     ),
     Fault(
         "runner-killed", 27, Action.STOP, 300, "bridge",
         "The runner was killed.",
-        "Look at its journal, then start and arm again.",
+        "Check its journal, then start and arm again.",
         "tests/process/test_edge_run.py::test_killed_while_driving_the_robot_gets_zero_within_300_ms",
     ),
     Fault(
         "control-thread-dead", 28, Action.STOP, 300, "bridge",
-        "The runner lives but its control thread does not: no commands come.",
+        "The runner runs but its control thread is dead: no commands arrive.",
         "The watchdog restarts the runner; report it with the journal.",
         "tests/firmware_bridge/test_bridge_core.py::TestDeadman::test_the_wire_is_zero_when_the_last_good_command_is_250_ms_old",
     ),
     Fault(
         "runner-frozen", 29, Action.STOP, 300, "bridge",
-        "The runner was frozen; commands that it left behind are refused by age and sequence.",
+        "The runner was frozen; its queued commands are refused by age and sequence.",
         "Find what stopped it, then arm again.",
         "tests/process/test_edge_run.py::test_frozen_while_driving_the_robot_gets_zero_within_300_ms_and_old_commands_stay_dead",
     ),
     Fault(
         "bridge-killed", 30, Action.STOP, 1200, "robot",
         "The bridge was killed: the robot itself drops a command after 1 s (simulated Go2; measure a real one).",
-        "systemd starts the bridge again, disarmed; look at its journal.",
+        "systemd starts the bridge again, disarmed; check its journal.",
         "tests/process/bridge/test_bridge_process.py::test_a_killed_bridges_successor_stops_the_moving_robot_first",
     ),
     Fault(
@@ -60,25 +60,25 @@ BRIDGE: tuple[Fault, ...] = (
     Fault(
         "bridge-hung", 31, Action.STOP, 1200, "robot",
         "The bridge hangs: the runner ends its run, the robot itself drops a command after 1 s.",
-        "systemd's watchdog restarts the bridge, disarmed; look at its journal.",
+        "systemd's watchdog restarts the bridge, disarmed; check its journal.",
         "tests/edge/run/test_control_loop.py::test_a_bridge_that_has_gone_silent_ends_the_loop",
     ),
     Fault(
         "link-lost", 35, Action.STOP, 1300, "bridge",
-        "Nothing comes from the robot any more.",
+        "The robot no longer sends anything.",
         "Check the cable to the robot and that the robot is on, then arm again.",
         "tests/firmware_bridge/test_bridge_dangers.py::test_without_the_robots_state_zero_goes_out_after_the_deadmans_time_and_the_state_is_not_latched",
     ),
     Fault(
         "message-reordered", 36, Action.NOTHING, 0, "bridge",
-        "A command came twice or in the wrong order and was dropped.",
+        "A command arrived twice or out of order and was dropped.",
         "Nothing to do.",
         "tests/firmware_bridge/test_bridge_core.py::TestGate::test_a_sequence_number_that_does_not_increase_is_rejected",
     ),
     Fault(
         "state-from-future", 36, Action.NOTHING, 0, "bridge",
-        "A report of the robot carried a time that has not come yet and was dropped.",
-        "Look for a second publisher of the robot's state: another robot or a forger.",
+        "A report of the robot carried a stamp in the future and was dropped.",
+        "Find the second publisher of the robot's state: another robot or a forger.",
         "tests/process/bridge/test_stop_means_stop.py::TestNotAlone::"
         "test_forged_states_with_future_stamps_do_not_hide_a_tipped_robot",
     ),
@@ -91,13 +91,13 @@ BRIDGE: tuple[Fault, ...] = (
     Fault(
         "late-motion", 38, Action.STOP, 40, "bridge",
         "A motion command overtook the stop; the stop was sent again.",
-        "Nothing to do: zero goes on being sent.",
+        "Nothing to do: the bridge keeps sending zero.",
         "tests/firmware_bridge/test_bridge_dangers.py::TestStopAgain::test_a_late_move_is_followed_by_a_zero_within_40_ms_whenever_it_comes",
     ),
     Fault(
         "stop-call-blocked", 39, Action.NOTHING, 0, "bridge",
-        "The robot does not answer StopMove; zero velocity was sent before it.",
-        "If it stays, restart the robot.",
+        "The robot does not answer StopMove; the bridge has already sent zero velocity.",
+        "If it persists, restart the robot.",
         "tests/firmware_bridge/test_bridge_core.py::TestEveryStop::test_a_zero_move_and_then_a_stop_move_go_out_first",
     ),
     Fault(
@@ -108,14 +108,14 @@ BRIDGE: tuple[Fault, ...] = (
     ),
     Fault(
         "lease-taken", 40, Action.STOP, 500, "bridge",
-        "Another client asked for the lease of the sport service, which shuts this bridge out.",
+        "Another client requested the lease of the sport service, which shuts this bridge out.",
         "Close the other program or app; while the robot moves, stop it with L2 and B on its remote.",
         "tests/process/bridge/test_stop_means_stop.py::TestConfirmation::"
         "test_a_lease_request_while_driving_is_a_second_commander",
     ),
     Fault(
         "stop-denied", 40, Action.STOP, 0, "bridge",
-        "Another client holds the lease: the robot denies the stop, and `edge-bridge stop` says that it still moves.",
+        "Another client holds the lease: the robot denies the stop, and `edge-bridge stop` reports that it moves.",
         "Press L2 and B on the robot's remote, or switch the robot off.",
         "tests/process/bridge/test_stop_means_stop.py::TestConfirmation::"
         "test_a_robot_that_another_client_drives_on_is_never_confirmed",
@@ -137,13 +137,13 @@ BRIDGE: tuple[Fault, ...] = (
     Fault(
         "robot-mode-left", 42, Action.STOP, 1000, "bridge",
         "The robot left its walking modes by itself.",
-        "Look at the robot: it may have fallen or been taken over; then arm again.",
+        "Check the robot: it may have fallen or been taken over; then arm again.",
         "tests/firmware_bridge/test_bridge_core.py::TestEveryStop::test_a_zero_move_and_then_a_stop_move_go_out_first",
     ),
     Fault(
         "robot-error", 42, Action.STOP, 1000, "bridge",
         "The robot reports an error of its own.",
-        "Look the error code up in the maker's manual before arming again.",
+        "Find the error code in the maker's manual before arming again.",
         "tests/firmware_bridge/test_bridge_dangers.py::TestEveryDanger::test_it_stops_a_driven_robot_in_the_same_step",
     ),
     Fault(
@@ -176,30 +176,30 @@ START: tuple[Fault, ...] = (
     Fault(
         "provider-missing", 24, Action.STOP, 0, "start",
         "An execution provider that the artifacts need is not on this machine.",
-        "Install it or export for this machine; the CPU is never used instead without being asked for.",
+        "Install it or export for this machine; the runner never falls back to the CPU by itself.",
         "tests/edge/artifacts/test_manifest.py::test_a_provider_that_this_machine_lacks_is_refused_by_name",
     ),
     Fault(
         "provider-partial", 25, Action.STOP, 0, "start",
         "The execution provider takes no part of a graph.",
-        "Build the engines again with edge-install engines and read what it says.",
+        "Build the engines again with edge-install engines and read its output.",
         "tests/edge/deploy/test_doctor.py::test_only_nodes_that_compute_shapes_may_run_on_the_processor",
     ),
     Fault(
         "artifact-corrupt", 53, Action.STOP, 0, "start",
-        "A file of the artifacts is not what its manifest says.",
+        "A file of the artifacts differs from its manifest entry.",
         "Copy or export the artifacts again.",
         "tests/edge/artifacts/test_manifest.py::test_a_damaged_directory_is_refused",
     ),
     Fault(
         "external-data", 54, Action.STOP, 0, "start",
         "A graph points to data outside the manifest's list.",
-        "Do not use these artifacts: somebody has changed them.",
+        "Do not use these artifacts: they were changed.",
         "tests/edge/artifacts/test_manifest.py::test_external_data_that_leaves_its_listed_file_is_refused",
     ),
     Fault(
         "manifest-changed", 55, Action.STOP, 0, "start",
-        "The manifest is not what was exported, or its signature does not match.",
+        "The manifest has changed since the export, or its signature does not match.",
         "Use the artifacts as they were exported, with the key that they were signed with.",
         "tests/edge/artifacts/test_signature.py::test_a_manifest_that_was_changed_and_sealed_again_is_refused_before_it_is_parsed",
     ),
@@ -230,7 +230,7 @@ START: tuple[Fault, ...] = (
     Fault(
         "restart-storm", 59, Action.STOP, 0, "start",
         "The runner failed five times in a row and is not started again.",
-        "Look at its journal: journalctl -u tic-vla-edge-runner.",
+        "Check its journal: journalctl -u tic-vla-edge-runner.",
         "tests/edge/deploy/test_units.py::test_slow_failing_starts_of_the_runner_are_counted_within_one_window",
     ),
     Fault(
@@ -258,4 +258,4 @@ FAULT_OF_CAUSE: Mapping[str, str] = MappingProxyType(
         "wrong_robot": "wrong-robot",
     }
 )
-"""What a stop of the bridge is in this table, by the cause that its status names (firmware_bridge.core.link.CAUSES)."""
+"""Fault of each cause of a bridge's stop (firmware_bridge.core.link.CAUSES)."""

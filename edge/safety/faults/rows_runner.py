@@ -1,4 +1,4 @@
-"""Faults that the runner itself notices: its inputs, its model, its machine."""
+"""Faults that the runner itself detects: its inputs, its model, its machine."""
 
 from __future__ import annotations
 
@@ -14,45 +14,45 @@ _ROBOT = "tests/edge/run/test_robot_inputs.py::test_"
 INPUTS: tuple[Fault, ...] = (
     Fault(
         "camera-stopped", 1, Action.ZERO, 500, _HERE,
-        "There is no new picture to drive by.",
-        "Check the camera's cable and service; driving goes on 1 s after pictures are back.",
+        "There is no new picture.",
+        "Check the camera's cable and service; driving resumes 1 s after pictures arrive again.",
         _STOPPED + "[camera-stopped]",
     ),
     Fault(
         "camera-frozen", 2, Action.ZERO, 500, _HERE,
         "The camera repeats pictures, or its scene stays the same, although the robot has moved.",
-        "If the robot did not slip on the spot, restart the camera service; driving goes on when the scene changes.",
+        "If the robot did not slip on the spot, restart the camera service; driving resumes when the scene changes.",
         _STOPPED + "[camera-frozen]",
     ),
     Fault(
         "camera-stale", 3, Action.ZERO, 300, _HERE,
-        "Pictures are more than 300 ms old when they arrive, too old to drive by.",
-        "Look for a queue or a slow network between camera and runner.",
+        "Pictures are more than 300 ms old on arrival, too old for driving.",
+        "Check for a queue or a slow network between camera and runner.",
         _STOPPED + "[camera-stale]",
     ),
     Fault(
         "camera-from-future", 4, Action.ZERO, 300, _HERE,
-        "A picture carries a time that has not come yet.",
-        "Check what stamps the pictures: stamps must be this machine's monotonic clock.",
+        "A picture carries a stamp in the future.",
+        "Check the source of the stamps: they must be of this machine's monotonic clock.",
         _STOPPED + "[camera-from-future]",
     ),
     Fault(
         "camera-slow", 5, Action.LIMIT, 1000, _HERE,
         "The camera sends far fewer pictures than it should.",
-        "Look for load on the robot's computer or network; the robot drives at half speed.",
+        "Check for load on the robot's computer or network; the robot drives at half speed.",
         _LIMITED + "[camera-slow]",
         speed_scale=0.5,
     ),
     Fault(
         "camera-too-slow", 5, Action.ZERO, 2000, _HERE,
         "The camera sends less than 40 % of its pictures.",
-        "Look for load on the robot's computer or network.",
+        "Check for load on the robot's computer or network.",
         _STOPPED + "[camera-too-slow]",
     ),
     Fault(
         "frame-refused", 6, Action.LIMIT, 500, _HERE,
         "A picture was black, saturated, torn or of the wrong size and was not used.",
-        "Nothing to do unless it comes back: then clean or replace the camera.",
+        "Nothing to do unless it recurs: then clean or replace the camera.",
         _ONCE + "[frame-refused black]",
     ),
     Fault(
@@ -70,7 +70,7 @@ INPUTS: tuple[Fault, ...] = (
     Fault(
         "odometry-jump", 8, Action.ZERO, 100, _HERE,
         "The robot's pose jumped further than the robot can move; the sample was not used.",
-        "Driving goes on by itself; a second jump stops the run.",
+        "Driving resumes by itself; a second jump stops the run.",
         _ROBOT + "one_jump_of_the_pose_stops_the_robot_for_a_second",
         escalation=Escalation("odometry-jumps", 2, 10_000),
     ),
@@ -95,20 +95,20 @@ INPUTS: tuple[Fault, ...] = (
     ),
     Fault(
         "odometry-not-finite", 10, Action.ZERO, 60, _HERE,
-        "The robot reports a pose or velocity that is no number or cannot be.",
-        "If it stays, restart the robot.",
+        "The robot reports a pose or velocity that is not finite or not possible.",
+        "If it persists, restart the robot.",
         _ROBOT + "a_pose_that_is_not_finite_stops_the_robot_within_its_bound",
     ),
     Fault(
         "odometry-late", 11, Action.LIMIT, 300, _HERE,
         "The robot's pose arrives late.",
-        "Look for load on the network to the robot; the robot drives at half speed.",
+        "Check for load on the network to the robot; the robot drives at half speed.",
         _ROBOT + "reports_that_stay_late_limit_the_speed_for_as_long_as_they_do",
         speed_scale=0.5,
     ),
     Fault(
         "odometry-stale", 11, Action.ZERO, 300, _HERE,
-        "The robot's pose is too old to drive by.",
+        "The robot's pose is too old for driving.",
         "Check the cable to the robot and that the robot is on.",
         _STOPPED + "[odometry-stale]",
     ),
@@ -128,7 +128,7 @@ INPUTS: tuple[Fault, ...] = (
     Fault(
         "tipped-over", 64, Action.STOP, 100, _HERE,
         "The robot leans by more than 30°: it was pushed, lifted or has fallen.",
-        "Put it on its feet by hand, look for damage, then arm again.",
+        "Put it on its feet by hand, check for damage, then arm again.",
         _LOOP + "a_robot_that_tips_over",
     ),
     Fault(
@@ -150,78 +150,78 @@ INPUTS: tuple[Fault, ...] = (
 MODEL: tuple[Fault, ...] = (
     Fault(
         "output-not-finite", 13, Action.ZERO, 40, _HERE,
-        "The action expert gave something that is not a number, or nothing.",
-        "If it stays, verify the artifacts: edge-export verify DIR.",
+        "The action expert's output is not finite, or missing.",
+        "If it persists, verify the artifacts: edge-export verify DIR.",
         _LOOP + "an_output_that_is_not_finite",
         clear_ms=500,
     ),
     Fault(
         "output-out-of-range", 14, Action.LIMIT, 100, _HERE,
-        "The action expert asked for far more speed than the robot may drive; it was cut to the limit.",
-        "Nothing to do unless it comes back.",
+        "The action expert planned far more speed than the limit; the command was cut to the limit.",
+        "Nothing to do unless it recurs.",
         _ONCE + "[output-out-of-range]",
         escalation=Escalation("output-out-of-range-often", 5, 1000),
     ),
     Fault(
         "output-out-of-range-often", 14, Action.STOP, 1000, _HERE,
-        "The action expert asked five times within 1 s for far more speed than the robot may drive.",
-        "Do not drive with these artifacts: verify them, then look at the flight log.",
+        "The action expert planned far more speed than the limit five times within 1 s.",
+        "Do not drive with these artifacts: verify them, then check the flight log.",
         _STOPPED + "[output-out-of-range-often]",
     ),
     Fault(
         "output-unsteady", 15, Action.LIMIT, 1000, _HERE,
         "The action expert's plan changes faster than the robot may follow.",
-        "Look at the flight log; the robot drives at half speed.",
+        "Check the flight log; the robot drives at half speed.",
         _LOOP + "plans_that_change_sides[output-unsteady]",
         speed_scale=0.5,
     ),
     Fault(
         "output-oscillating", 15, Action.ZERO, 1000, _HERE,
         "The action expert's output swings from one side to the other at every tick.",
-        "Look at the flight log before driving on with these artifacts.",
+        "Check the flight log before driving again with these artifacts.",
         _LOOP + "plans_that_change_sides[output-oscillating]",
     ),
     Fault(
         "output-constant", 16, Action.ZERO, 2500, _HERE,
-        "The action expert gives the same plan although what it sees has changed for 2 s.",
+        "The action expert repeats one plan although its picture has changed for 2 s.",
         "Verify the artifacts; a network that ignores its inputs must not drive.",
         _STOPPED + "[output-constant]",
     ),
     Fault(
         "semantic-old", 17, Action.LIMIT, 10_300, _HERE,
-        "The last answer of the reasoning is older than the policy was trained for; the speed falls with its age.",
+        "The semantic state is older than the policy was trained for; the speed falls with its age.",
         "Reasoning is slow: allow fewer tokens or more power.",
         _LIMITED + "[semantic-old]",
     ),
     Fault(
         "semantic-expired", 17, Action.ZERO, 15_300, _HERE,
-        "The last answer of the reasoning is too old to drive by.",
-        "Driving goes on with its next answer; a call that hangs is interrupted.",
+        "The semantic state is too old for driving.",
+        "Driving resumes with the next generation; a call that hangs is interrupted.",
         _STOPPED + "[semantic-expired]",
     ),
     Fault(
         "reasoning-failed", 18, Action.LIMIT, 300, _HERE,
-        "A run of the reasoning failed; the next one is tried.",
-        "Nothing to do unless it comes back.",
+        "A generation failed; the next one is tried.",
+        "Nothing to do unless it recurs.",
         _ONCE + "[reasoning-failed]",
         escalation=Escalation("reasoning-failing", 5, 60_000),
     ),
     Fault(
         "reasoning-failing", 18, Action.STOP, 300, _HERE,
         "Reasoning failed five times within 60 s.",
-        "Verify the artifacts and look at the memory in use: edge-doctor.",
+        "Verify the artifacts and check the memory in use: edge-doctor.",
         _STOPPED + "[reasoning-failing]",
     ),
     Fault(
         "reasoning-hung", 17, Action.STOP, 30_300, _HERE,
         "The reasoning hangs in a call that an interrupt does not end.",
-        "The runner ends and its service starts it again; look at the kernel log for the accelerator's driver.",
+        "The runner ends and its service starts it again; check the kernel log for the accelerator's driver.",
         "tests/edge/safety/test_watchdog.py::test_a_call_that_an_interrupt_does_not_end_is_given_up",
     ),
     Fault(
         "semantic-text-invalid", 19, Action.ZERO, 300, _HERE,
-        "Three answers of the reasoning in a row were not in the agreed form.",
-        "Check that the model belongs to these artifacts; driving goes on with its next valid answer.",
+        "Three reasoning texts in a row do not follow the grammar.",
+        "Check that the model belongs to these artifacts; driving resumes with its next valid text.",
         _LOOP + "three_invalid_texts",
     ),
     Fault(
@@ -232,15 +232,15 @@ MODEL: tuple[Fault, ...] = (
     ),
     Fault(
         "stop-phrase", 47, Action.STOP, 300, _HERE,
-        "A stop phrase came by the instruction channel.",
+        "The instruction channel received a stop phrase.",
         "Find out why, then edge-bridge arm, then start a new run.",
         "tests/process/bridge/test_stop_phrase_process.py::"
         "test_without_a_bridge_that_this_user_can_reach_the_runner_stops_the_robot_itself",
     ),
     Fault(
         "semantic-delay-invalid", 21, Action.ZERO, 100, _HERE,
-        "The reasoning's answer carries a time that has not come yet.",
-        "Restart the runner; if it stays, report it with the flight log.",
+        "The semantic state carries a stamp in the future.",
+        "Restart the runner; if it persists, report it with the flight log.",
         _LOOP + "a_semantic_state_from_the_future",
     ),
 )  # fmt: skip
@@ -249,14 +249,14 @@ MACHINE: tuple[Fault, ...] = (
     Fault(
         "tick-late", 22, Action.LIMIT, 1000, _HERE,
         "The control loop is often late.",
-        "Something else uses the processor: edge-doctor says what; the robot drives at half speed.",
+        "Another program uses the processor: edge-doctor names it; the robot drives at half speed.",
         _LIMITED + "[tick-late]",
         speed_scale=0.5,
     ),
     Fault(
         "tick-overrun", 22, Action.ZERO, 300, _HERE,
         "The last pass of the control loop took longer than two periods.",
-        "Something else uses the processor: edge-doctor says what.",
+        "Another program uses the processor: edge-doctor names it.",
         _LOOP + "a_tick_that_takes_too_long_stops_the_robot_and_a_late_one_does_not",
     ),
     Fault(
@@ -267,14 +267,14 @@ MACHINE: tuple[Fault, ...] = (
     ),
     Fault(
         "suspended", 34, Action.STOP, 300, _HERE,
-        "The machine slept while the robot was armed: everything that is known is old.",
+        "The machine slept while the robot was armed: all inputs are old.",
         "Turn suspend off on this machine, then arm again.",
         _STOPPED + "[suspended]",
     ),
     Fault(
         "clock-backwards", 34, Action.STOP, 300, _HERE,
         "The monotonic clock went backwards.",
-        "Restart the machine; if it stays, its clock source is broken.",
+        "Restart the machine; if it persists, its clock source is broken.",
         _LOOP + "a_clock_that_runs_backwards",
     ),
     Fault(
@@ -293,13 +293,13 @@ MACHINE: tuple[Fault, ...] = (
     ),
     Fault(
         "log-disk-full", 51, Action.NOTHING, 0, _HERE,
-        "The flight log's disk is full: records are dropped and counted, driving goes on.",
+        "The flight log's disk is full: records are dropped and counted, driving continues.",
         "Free space before the next run.",
         "tests/edge/flightlog/test_recorder.py::test_a_disk_that_is_full_stops_writing_and_is_reported",
     ),
     Fault(
         "log-disk-stalled", 52, Action.NOTHING, 0, _HERE,
-        "The flight log's disk hangs: records are dropped and counted, driving goes on.",
+        "The flight log's disk hangs: records are dropped and counted, driving continues.",
         "Check the disk before the next run.",
         "tests/edge/flightlog/test_recorder.py::test_a_hanging_disk_costs_the_caller_records_not_time",
     ),

@@ -1,4 +1,4 @@
-"""Is the picture fit to drive by? Stopped, frozen, stale, future, slow, black, saturated, torn, wrong size, swapped."""
+"""Checks the picture: stopped, frozen, stale, future, slow, black, saturated, torn, wrong size, swapped camera."""
 
 from __future__ import annotations
 
@@ -16,37 +16,37 @@ from edge.safety.monitors.scene import SceneConfig, SceneMonitor
 from edge.state.frame import Frame
 
 DARK, BRIGHT = 8, 247
-"""Of 255: a picture with nearly all values beyond one of these shows nothing."""
+"""Grey levels of 255; a picture with nearly all values beyond one of these is black or saturated."""
 SHOWS_NOTHING = 0.01
-"""Share of the values that must lie within, for a picture to show something."""
+"""Share of the values that must lie between them in a usable picture."""
 BAD_IN_A_ROW = 3
 RATE_WINDOW_NS = 1_000_000_000
 CONTENTS_KEPT = 32
-"""Pictures whose content is remembered: the most buffers that a V4L2 driver hands out in turn."""
+"""Number of remembered picture contents: the largest number of buffers in a V4L2 driver's rotation."""
 SLOW, TOO_SLOW = 0.65, 0.4
-"""Shares of the expected pictures in a second; half of them missing must be found although counting is off by one."""
+"""Shares of the expected pictures in a second; they detect the loss of half although the count is off by one."""
 
 
 @dataclass(frozen=True)
 class FrameConfig:
-    """What is expected of the camera. With ticks of 100 ms and a bridge of 20 ms its ages keep zero below 500 ms."""
+    """Expectations of the camera. With ticks of 100 ms and a bridge of 20 ms, its ages keep zero below 500 ms."""
 
     image_px: int | None
     """Side of the encoder's picture; None: not checked."""
     rate_hz: float
-    """Pictures a second that the control thread can see: the camera's rate, the tick's at most."""
+    """Pictures a second that the control thread receives: the camera's rate, at most that of the tick."""
     stopped_ms: float = 300.0
-    """Zero when the picture that is driven by is older."""
+    """Age of the picture in use above which the velocity is zero."""
     stale_ms: float = 300.0
-    """A picture that is older when it is first seen is refused. Fault matrix row 3 asks for 200 ms; one that comes just
-    after a tick waits a period for the next, which with 100 ms of the camera's own would be beyond that."""
+    """Age at first sight above which a picture is refused. Fault matrix row 3 gives 200 ms; a picture that arrives just
+    after a tick waits one period more, which exceeds 200 ms with the camera's own 100 ms."""
     frozen_ms: float = 190.0
-    """Zero when content comes again that is so old or older although the robot has moved since. At 10 Hz this is the
-    second repetition of one picture, or the first repetition of two or more in turn."""
+    """Age from which repeated content gives zero although the robot has moved since. At 10 Hz this is the second
+    repetition of one picture, or the first repetition of two or more in turn."""
     moved_m: float = 0.02
     moved_rad: float = 0.02
     scene: SceneConfig = field(default_factory=SceneConfig)
-    """When a picture that is not equal byte for byte counts as frozen."""
+    """Thresholds for a frozen picture that is not equal byte for byte."""
 
     def __post_init__(self) -> None:
         numbers = [value for value in vars(self).values() if not isinstance(value, SceneConfig)]
@@ -56,7 +56,7 @@ class FrameConfig:
 
 @dataclass(frozen=True)
 class FrameOutputs:
-    """Whether the newest picture may be used, a number that stands for its content, and what was found."""
+    """Whether the newest picture may be used, a hash of its content, and the findings."""
 
     usable: bool
     content: int
@@ -105,11 +105,11 @@ class FrameMonitor:
         return FrameOutputs(self._usable, self._content, tuple(findings))
 
     def age(self, driven_ns: int | None, now_ns: int) -> tuple[Finding, ...]:
-        """Judge the age of the picture that is driven by (its capture), whether camera or encoder delayed it."""
+        """Check the age since capture of the picture in use, whether camera or encoder delayed it."""
         age_ms = None if driven_ns is None else (now_ns - driven_ns) / 1e6
         if age_ms is not None and age_ms <= self._config.stopped_ms:
             return ()
-        detail = "none yet" if age_ms is None else f"the one that is driven by is {age_ms:.0f} ms old"
+        detail = "none yet" if age_ms is None else f"the picture in use is {age_ms:.0f} ms old"
         return (Finding("camera-stopped", detail),)
 
     def _judge(self, picture: Frame, T_odom_base: SE2 | None, now_ns: int, findings: list[Finding]) -> None:
@@ -129,7 +129,7 @@ class FrameMonitor:
             self._judge_content(picture, T_odom_base)
 
     def _defect(self, picture: Frame) -> str:
-        """What is wrong with the picture itself, for the operator; empty when it is good."""
+        """Return the defect of the picture itself, for the operator; empty when it is good."""
         pixels, px = picture.pixels, self._config.image_px
         if pixels.ndim != 4 or pixels.dtype != np.uint8 or (px is not None and pixels.shape != (1, px, px, 3)):
             return f"expected {px}×{px} RGB, found {pixels.dtype}{list(pixels.shape)}"
@@ -151,19 +151,19 @@ class FrameMonitor:
         return ""
 
     def _judge_content(self, picture: Frame, T_odom_base: SE2 | None) -> None:
-        # Every fourth line: whatever moves in a picture moves there too, at a quarter of the cost.
+        # Every fourth line shows the same motion at a quarter of the cost.
         self._content = zlib.crc32(picture.pixels[0, ::4].tobytes())
         if T_odom_base is not None:
             scene = self._scene.step(picture.pixels, T_odom_base, picture.stamp_ns)
             self._frozen = self._repetition(picture.stamp_ns, T_odom_base) or scene
 
     def _repetition(self, stamp_ns: int, T_odom_base: SE2) -> str:
-        """Why this content counts as a repetition of an earlier picture; empty when it does not.
+        """Return why this content counts as a repetition of an earlier picture; empty when it does not.
 
-        A robot that stands still may see the same picture for ever; one that moves may not.
+        A picture may repeat while the robot stands still, but not while it moves.
         """
         first_ns, T_odom_first = self._contents.setdefault(self._content, (stamp_ns, T_odom_base))
-        # A picture that is repeated stays: it must still be recognised when the robot has stopped because of it.
+        # Keep a repeated picture: it must still be recognised once the robot has stopped because of it.
         self._contents.move_to_end(self._content)
         if len(self._contents) > CONTENTS_KEPT:
             self._contents.popitem(last=False)

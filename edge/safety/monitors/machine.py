@@ -1,4 +1,4 @@
-"""Is this machine fit to drive? Late ticks, a clock that jumped, sleep. (Its heat: `edge.power`.)"""
+"""Checks this machine: late ticks, a clock that jumped, sleep. (Its heat: `edge.power`.)"""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from edge.safety.faults.findings import Finding
 
 WINDOW_TICKS = 10
 LATE_TICKS = 3
-"""Of the last ten: openpilot calls a model lagging when more than 20 % of its frames are dropped (facts, "Figures")."""
+"""Late ticks of the last ten. openpilot: a model lags when more than 20 % of its frames drop (facts, "Figures")."""
 OVERRUN_PERIODS = 2.0
 GAP_NS = 1_000_000_000
-"""Between two ticks: this process was frozen, or starved."""
+"""Gap between two ticks above which this process counts as frozen or starved."""
 SLEPT_NS = 100_000_000
-"""The clock that counts sleep and the one that does not part by less than this, unless the machine slept."""
+"""Largest difference between the clock that counts sleep and the one that does not, unless the machine slept."""
 
 
 class MachineMonitor:
@@ -26,7 +26,7 @@ class MachineMonitor:
         self._asleep_ns: int | None = None
 
     def step(self, last_tick_ns: int | None, asleep_ns: int, now_ns: int) -> tuple[Finding, ...]:
-        """Judge the tick before this one and the machine.
+        """Check the previous tick and the machine.
 
         `last_tick_ns`: from that tick's deadline to its command; `asleep_ns`: boot time less monotonic time, which
         grows by the time that the machine slept.

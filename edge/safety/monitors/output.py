@@ -1,4 +1,4 @@
-"""Is what the action expert gives fit to drive by? Not finite, out of range, wavering, constant."""
+"""Checks the action expert's plan: not finite, out of range, wavering, constant."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from edge.safety.faults.findings import Finding
 from firmware_bridge.core.config import LimitsConfig
 
 OUT_OF_RANGE = 5.0
-"""A plan this many times as fast as the limit is no plan: what the policy learned from stayed near the limits."""
+"""Multiple of the speed limit from which a plan is out of range: the training data stayed near the limits."""
 WINDOW_S = 1.0
 UNSTEADY, OSCILLATING = 0.2, 0.5
-"""Shares of the ticks of a second in which the plan turned back on itself (fault matrix, row 15)."""
+"""Shares of the ticks of a second in which the plan reversed its change (fault matrix, row 15)."""
 CONSTANT_NS = 2_000_000_000
 CHANGED_PICTURES = 5
 
@@ -35,7 +35,7 @@ class OutputConfig:
 
 
 class OutputMonitor:
-    """Remembers the last plan and how the velocity it asked for has changed within a second."""
+    """Keeps the last plan and the changes of its velocity within a second."""
 
     def __init__(self, config: OutputConfig) -> None:
         self._config = config
@@ -48,7 +48,7 @@ class OutputMonitor:
         self._changed = 0
 
     def step(self, trajectory: npt.NDArray[np.float32] | None, content: int, now_ns: int) -> tuple[Finding, ...]:
-        """Judge a plan [steps, 3]; None while the action expert was not asked. `content` stands for the picture."""
+        """Check a plan [steps, 3], None where the action expert did not run. `content`: hash of the picture."""
         if trajectory is None:
             self._velocity, self._plan = None, None
             self._turns.clear()
@@ -68,8 +68,8 @@ class OutputMonitor:
         velocity = scale_to_limits(speed, yaw_rate, limits, 1.0)
         if self._velocity is not None:
             change = (velocity[0] - self._velocity[0], velocity[1] - self._velocity[1])
-            # More than the slew limit lets through in a tick, and back again: an ordinary start is a limited change
-            # too, but it does not turn back.
+            # A change beyond the slew limit of a tick, then its reversal: an ordinary start is a limited change
+            # too, but it does not reverse.
             steps = (limits.accel_mps2 * config.period_s, limits.alpha_radps2 * config.period_s)
             turned = any(
                 now * before < 0 and min(abs(now), abs(before)) > step

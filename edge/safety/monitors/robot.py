@@ -1,4 +1,4 @@
-"""Is the robot fit to be driven? Age and rate of its state, and its attitude. (Its battery: `edge.power`.)"""
+"""Checks the robot: age and rate of its state, and its attitude. (Its battery: `edge.power`.)"""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from edge.state.pose_history import StampedPose
 TIPPED_RAD = math.radians(30.0)
 LINK_WINDOW_NS = 2_000_000_000
 LOSSY = 0.65
-"""Share of the state messages: 10 % lost is no fault, half of them is (fault matrix, row 35)."""
+"""Share of the state messages below which the loss is a fault: 10 % lost is none, half is (matrix, row 35)."""
 ENOUGH_HZ = 50.0
-"""The rate of `rt/sportmodestate` (protocol facts, 49.5 Hz received): what a robot sends above may be lost."""
+"""Rate of `rt/sportmodestate` (protocol facts, 49.5 Hz received); messages beyond it may be lost."""
 _JUDGE_NS = 250_000_000
 
 
 class Attitude(Protocol):
-    """What the monitor reads of the robot's state."""
+    """The robot's state as the monitor reads it."""
 
     @property
     def roll_rad(self) -> float:
-        """About the forward axis."""
+        """Rotation about the forward axis."""
 
     @property
     def pitch_rad(self) -> float:
-        """About the left axis."""
+        """Rotation about the left axis."""
 
 
 @dataclass(frozen=True)
@@ -46,10 +46,10 @@ class RobotWatchConfig:
 
 
 class LinkMonitor:
-    """How many of a robot's states are lost, by the gaps between its own stamps; for a robot with a clock.
+    """Measures the loss of state messages from the gaps between the robot's own stamps; for a robot with a clock.
 
-    The robot's rate need not be known, and the link need not be good at the start: the period is the shortest that a
-    quarter of the stamps have kept to.
+    It needs neither the robot's rate nor a good link at the start: the period is the shortest one that a quarter of the
+    stamps have kept.
     """
 
     def __init__(self) -> None:
@@ -58,12 +58,12 @@ class LinkMonitor:
         self._period_ns = math.inf
 
     def step(self, robot_stamp_ns: int) -> tuple[Finding, ...]:
-        """Take the stamp of a state as it is accepted; given again four times a second for as long as it is lossy."""
+        """Take the stamp of an accepted state; a finding repeats four times a second while the link is lossy."""
         stamps = self._stamps
         if robot_stamp_ns <= 0:
             return ()
         if stamps and not 0 < robot_stamp_ns - stamps[-1] <= LINK_WINDOW_NS:
-            stamps.clear()  # its clock was set, or nothing came at all, which is not this fault
+            stamps.clear()  # the clock was set, or no message arrived, which is another fault
         stamps.append(robot_stamp_ns)
         while len(stamps) > 1 and robot_stamp_ns - stamps[1] >= LINK_WINDOW_NS:
             stamps.popleft()
@@ -81,7 +81,7 @@ class LinkMonitor:
 
 
 class RobotMonitor:
-    """Remembers how many state messages came, and how many were dropped; the rate of the first seconds is expected."""
+    """Counts received and dropped state messages; the rate of the first seconds is the expected one."""
 
     def __init__(self, config: RobotWatchConfig) -> None:
         self._config = config
@@ -90,11 +90,11 @@ class RobotMonitor:
         self._expected: float | None = None
 
     def begin(self, malformed: int) -> None:
-        """Reports that were dropped until now do not count."""
+        """Ignore the reports dropped so far."""
         self._malformed = malformed
 
     def urgent(self, attitude: Attitude | None, malformed: int) -> tuple[Finding, ...]:
-        """What does not wait for a tick: a robot that tipped over, a report that had to be dropped (counted so far)."""
+        """Return the urgent findings: a tipped robot, a dropped report (`malformed`: their count so far)."""
         findings: tuple[Finding, ...] = ()
         if malformed > self._malformed:
             self._malformed = malformed
@@ -105,7 +105,7 @@ class RobotMonitor:
         return (*findings, Finding("tipped-over", f"roll {roll:.0f}°, pitch {pitch:.0f}°"))
 
     def step(self, pose: StampedPose | None, states: int | None, now_ns: int) -> tuple[Finding, ...]:
-        """Judge the newest pose and the count of state messages so far; None: not known."""
+        """Check the newest pose and the count of state messages so far; None: unknown."""
         findings: list[Finding] = []
         age_ms = None if pose is None else (now_ns - pose.stamp_ns) / 1e6
         if age_ms is None or not 0 <= age_ms <= self._config.stale_ms:

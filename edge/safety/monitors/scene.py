@@ -1,4 +1,4 @@
-"""Does the scene change as odometry says that it must? Finds frozen pictures that are not equal byte for byte.
+"""Checks that the scene changes as odometry predicts. Finds frozen pictures that are not equal byte for byte.
 
 The monitor keeps a small grey copy of the picture every few centimetres or degrees of travel. It compares the newest
 picture with the copies from which odometry has moved far enough. A live camera changes wherever the picture has
@@ -21,14 +21,14 @@ from edge.core.geometry import SE2
 GRID: Final = 32
 """Blocks along each side of the grey copy."""
 LINES_PER_BLOCK: Final = 7
-"""Lines of the picture that make a block mean; more lower its noise little and cost time."""
+"""Number of picture lines in a block mean; more cost time and hardly lower its noise."""
 CELL: Final = 4
-"""Blocks along each side of a cell. Cells are counted, so that a small overlay counts little however busy it is."""
+"""Blocks along each side of a cell. Counting cells gives a small, busy overlay little weight."""
 CELLS: Final = GRID // CELL
 FOCAL_BLOCKS: Final = 13.0
 """Focal length of a 100° camera, blocks; a narrower camera sees more motion than expected, never less."""
 DEPTH_M: Final = 5.0
-"""Assumed distance of the scene: within it are the floor ahead and most indoor walls."""
+"""Assumed distance of the scene, m: the floor ahead and most indoor walls are nearer."""
 
 _Grey = npt.NDArray[np.int16]
 _Floats = npt.NDArray[np.float64]
@@ -43,30 +43,30 @@ class SceneConfig:
 
     moved_m: float = 0.2
     moved_rad: float = math.radians(10.0)
-    """Odometry between two pictures that are compared: above what 0.1 s of error in a stamp makes at 1 rad/s."""
+    """Smallest odometry motion between two compared pictures: above the effect of a 0.1 s stamp error at 1 rad/s."""
     slowest_mps: float = 0.03
     slowest_radps: float = math.radians(0.5)
-    """Slower motion may be drift of the odometry of a robot that stands."""
+    """Speed below which motion may be odometry drift of a standing robot."""
     spacing_m: float = 0.05
     spacing_rad: float = math.radians(2.0)
     copies: int = 24
     compared: int = 4
-    """Of the copies that are far enough away, so many of the newest are compared. Beyond 0.5 m a corridor may look the
-    same again: panels and tiles repeat. Fewer would miss stale buffers in turn that differ by noise."""
+    """Number of the newest sufficiently distant copies that are compared. Beyond 0.5 m a corridor may repeat itself:
+    panels, tiles. Fewer copies would miss rotating stale buffers that differ by noise."""
     changed_levels: int = 2
-    """Of 255: a block mean that differs by more has changed. Sensor noise and JPEG change block means by less."""
+    """Difference of 255 above which a block mean has changed. Sensor noise and JPEG change block means by less."""
     expected_levels: float = 4.0
-    """Of 255: only blocks that image motion must change by so much are judged."""
+    """Predicted change of 255 from which a block is judged."""
     cell_share: float = 0.25
     """Share of its judged blocks that must change for a cell to count as changed."""
     min_cells: int = 20
-    """Fewer textured cells than this, of 64, prove nothing: a blank wall."""
+    """Number of textured cells, of 64, below which a picture proves nothing: a blank wall."""
     frozen_share: float = 0.2
-    """Share of the textured cells. Simulated drives: 0.48 and more change when live; a clock changes below 0.1."""
+    """Share of textured cells that must change. Simulated drives: 0.48 or more when live; a clock: below 0.1."""
     overlay_share: float = 0.3
-    """Share of all blocks; a picture that changes in more than this is live whatever was expected."""
+    """Share of all blocks above which a change proves a live picture whatever was predicted."""
     release_pictures: int = 10
-    """Live pictures in a row that end a frozen verdict: of stale buffers in turn, some look live for a moment."""
+    """Live pictures in a row that end a frozen verdict: rotating stale buffers appear live for a moment."""
 
     def __post_init__(self) -> None:
         if not all(math.isfinite(value) and value > 0 for value in vars(self).values()):
@@ -93,7 +93,7 @@ class SceneMonitor:
         self._live_in_a_row = 0
 
     def step(self, pixels: npt.NDArray[np.uint8], T_odom_base: SE2, stamp_ns: int) -> str:
-        """Judge a picture [1, h, w, 3] captured at `T_odom_base`; returns why it counts as frozen, empty when live.
+        """Check a picture [1, h, w, 3] captured at `T_odom_base`; return why it counts as frozen, empty when live.
 
         A frozen verdict lasts until `release_pictures` in a row do not count as frozen, also while the robot stands.
         """
@@ -104,14 +104,14 @@ class SceneMonitor:
         if detail:
             self._frozen = detail
         elif self._frozen and self._live_in_a_row >= self._config.release_pictures:
-            # Copies of frozen pictures carry poses at which they were not captured.
+            # Copies of frozen pictures have wrong poses.
             self._frozen, self._taken, self._newest = "", 0, -1
             went_m, turned_rad = went_m[:0], turned_rad[:0]
         self._remember(grey, T_odom_base, stamp_ns, went_m, turned_rad)
         return self._frozen
 
     def _motion(self, T_odom_base: SE2) -> tuple[_Floats, _Floats]:
-        """Metres and radians from every copy to a pose."""
+        """Return the distance, m, and rotation, rad, from every copy to a pose."""
         offset = np.array(T_odom_base.as_tuple()) - self._poses[: self._taken]
         turned_rad = np.abs((offset[:, 2] + math.pi) % (2 * math.pi) - math.pi)
         return np.hypot(offset[:, 0], offset[:, 1]), turned_rad
@@ -119,7 +119,7 @@ class SceneMonitor:
     def _must_change(self, went_m: _Floats, turned_rad: _Floats, stamp_ns: int) -> npt.NDArray[np.intp]:
         """Rows of the copies from which the robot has moved so far that the scene must differ."""
         config = self._config
-        # Once it is stopped as frozen, the robot stands: its mean speed no longer tells motion from drift.
+        # Once a frozen picture has stopped the robot, its mean speed no longer separates motion from drift.
         elapsed_s = 0.0 if self._frozen else (stamp_ns - self._near_ns[: self._taken]) / 1e9
         went = (went_m >= config.moved_m) & (went_m >= config.slowest_mps * elapsed_s)
         turned = (turned_rad >= config.moved_rad) & (turned_rad >= config.slowest_radps * elapsed_s)
@@ -171,8 +171,8 @@ class SceneMonitor:
 def expected_change(grey: _Grey, motion: SE2) -> npt.NDArray[np.float32]:
     """Change that `motion` (robot frame, m and rad) makes in each block of a grey copy [32, 32]; levels of 255.
 
-    Gradient times image motion of a pinhole camera that looks ahead at a scene `DEPTH_M` away, at most one block.
-    Edges along the image motion, such as those of a corridor seen ahead, expect none.
+    Gradient times image motion of a forward pinhole camera and a scene `DEPTH_M` away, at most one block. The result is
+    zero for edges along the image motion, such as those of a corridor ahead.
     """
     dy, dx = np.gradient(grey.astype(np.float32))
     across = FOCAL_BLOCKS * (motion.theta_rad + motion.y_m / DEPTH_M) + _U * (motion.x_m / DEPTH_M)
@@ -182,7 +182,7 @@ def expected_change(grey: _Grey, motion: SE2) -> npt.NDArray[np.float32]:
 
 
 def _shrink(pixels: npt.NDArray[np.uint8]) -> _Grey:
-    """Block means of a picture [1, h, w, 3] as grey values [32, 32]."""
+    """Return the block means of a picture [1, h, w, 3] as grey values [32, 32]."""
     lines = pixels[0, :: max(1, pixels.shape[1] // (GRID * LINES_PER_BLOCK))]
     small = cv2.resize(lines, (GRID, GRID), interpolation=cv2.INTER_AREA)
     grey: _Grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.int16)

@@ -1,4 +1,4 @@
-"""Is the reasoning's answer fit to drive by? Its age, its text, and whether new ones come at all."""
+"""Checks the semantic state: its age, its text, and the failures of generations."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ _MAX_REPORTED_FAILURES = 5
 
 @dataclass(frozen=True)
 class SemanticConfig:
-    """How old an answer may be. At `trained_delay_s` the speed begins to fall, `fade_s` later it is zero."""
+    """Permitted age of the semantic state. At `trained_delay_s` the speed begins to fall, `fade_s` later it is zero."""
 
     trained_delay_s: float = 10.0
     """The largest Δt that the policy was trained for (the targets' runtime.max_delay_s)."""
     fade_s: float = 5.0
     judge_text: bool = False
-    """Whether three texts in a row that are not in the agreed form stop the robot; not for an untrained model."""
+    """Whether three invalid texts in a row stop the robot; False for an untrained model."""
 
     def __post_init__(self) -> None:
         if not (0 < self.trained_delay_s <= 600 and 0 < self.fade_s <= 600):
@@ -27,7 +27,7 @@ class SemanticConfig:
 
 
 class SemanticMonitor:
-    """Remembers the last generation and how many texts in a row were invalid."""
+    """Keeps the last generation and the count of invalid texts in a row."""
 
     def __init__(self, config: SemanticConfig) -> None:
         self._config = config
@@ -36,10 +36,10 @@ class SemanticMonitor:
         self._failed = 0
 
     def step(self, semantic: SemanticState | None, failed: int, now_ns: int, invalid: int = 0) -> tuple[Finding, ...]:
-        """Judge the newest semantic state; `failed` counts the runs of the reasoning that failed so far.
+        """Check the newest semantic state; `failed` counts the failed generations so far.
 
-        `invalid`: texts in a row, up to now, that were not in the agreed form. A policy that is guided by waypoints is
-        never given such a text, so it cannot be seen in the state.
+        `invalid`: number of texts in a row, up to now, that do not follow the grammar. A policy that is guided by
+        waypoints never receives such a text, so the state does not show it.
         """
         findings: list[Finding] = []
         for _ in range(min(failed - self._failed, _MAX_REPORTED_FAILURES)):
@@ -66,5 +66,5 @@ class SemanticMonitor:
         self._generation = semantic.generation
         if semantic.waypoints is not None:
             self._invalid = 0
-        elif semantic.text_complete:  # a text that the budget cut short proves nothing about the model
+        elif semantic.text_complete:  # a text that was cut short proves nothing about the model
             self._invalid += 1

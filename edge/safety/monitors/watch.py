@@ -1,4 +1,4 @@
-"""All monitors together, in the order in which a tick needs them, and where they get what the tick does not know."""
+"""Runs all monitors in the order of a tick, with sources for the inputs that a tick lacks."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from edge.state.semantic import SemanticState
 
 
 def asleep_ns() -> int:
-    """How long this machine has slept since it was started: boot time less monotonic time.
+    """Return the time that this machine has slept since boot, ns: boot time less monotonic time.
 
-    Boot time is read first: a thread that is held up between the two readings gives less, never more.
+    Boot time is read first: a delay between the two readings gives less, never more.
     """
     boot_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
     return boot_ns - time.monotonic_ns()
@@ -33,24 +33,24 @@ def asleep_ns() -> int:
 
 @dataclass(frozen=True)
 class Sources:
-    """What monitors ask for in every tick; none may wait or raise. The defaults know nothing."""
+    """Sources that monitors read in every tick; none may wait or raise. The defaults report nothing."""
 
     findings: FindingQueue = field(default_factory=FindingQueue)
-    """What other threads have found: odometry, battery, heat."""
+    """Findings of other threads: odometry, battery, heat."""
     attitude: Callable[[], Attitude | None] = lambda: None
     states: Callable[[], int | None] = lambda: None
-    """State messages of the robot so far."""
+    """Number of state messages of the robot so far."""
     malformed: Callable[[], int] = lambda: 0
-    """Of them, those that were dropped because something in them cannot be."""
+    """Number of them that were dropped for an impossible value."""
     failed_generations: Callable[[], int] = lambda: 0
     invalid_texts: Callable[[], int] = lambda: 0
-    """Complete texts in a row, up to the newest, that were not in the agreed form, also those never published."""
+    """Number of complete texts in a row, up to the newest, that do not follow the grammar, published or not."""
     asleep_ns: Callable[[], int] = asleep_ns
 
 
 @dataclass(frozen=True)
 class WatchConfig:
-    """What each monitor expects."""
+    """Limits of all monitors."""
 
     frame: FrameConfig
     output: OutputConfig
@@ -67,7 +67,7 @@ class WatchConfig:
         camera_hz: float | None = None,
         semantic: SemanticConfig | None = None,
     ) -> WatchConfig:
-        """The fault matrix's values for a robot and a tick; `image_px` None: whatever size the camera gives."""
+        """Return the fault matrix's values for a robot and a tick; `image_px` None: any picture size."""
         tick_hz = 1e9 / period_ns
         stale_ms = min(controller.odometry_max_age_ms, RobotWatchConfig.stale_ms)
         return WatchConfig(
@@ -92,22 +92,22 @@ class Watch:
         self._pictures = FrameOutputs(False, 0, ())
 
     def begin(self) -> None:
-        """Driving begins now: what other threads found while the robot was stood up is over."""
+        """Begin driving: discard other threads' findings from the time of arming."""
         self._sources.findings.take()
         self._robot.begin(self._sources.malformed())
 
     def picture(self, picture: Frame | None, T_odom_base: SE2 | None, now_ns: int) -> bool:
-        """Before the encoder: whether the newest picture may be used. `tick` returns what was found."""
+        """Return, before the encoder, whether the newest picture may be used; `tick` returns the findings."""
         self._pictures = self._frame.step(picture, T_odom_base, now_ns)
         return self._pictures.usable
 
     def urgent(self) -> tuple[Finding, ...]:
-        """What must not wait for the next tick: other threads' findings, a tipped robot, a report that cannot be."""
+        """Return the urgent findings: other threads', a tipped robot, an impossible report."""
         sources = self._sources
         return (*sources.findings.take(), *self._robot.urgent(sources.attitude(), sources.malformed()))
 
     def standing(self, picture: Frame | None, pose: StampedPose | None, now_ns: int) -> tuple[Finding, ...]:
-        """Before arming: what was found of the newest picture, the robot and by other threads."""
+        """Return the findings before arming: the newest picture, the robot, other threads."""
         self.picture(picture, None if pose is None else pose.T_odom_base, now_ns)
         return (
             *self.urgent(),
@@ -125,9 +125,9 @@ class Watch:
         last_tick_ns: int | None,
         now_ns: int,
     ) -> tuple[Finding, ...]:
-        """After the action expert: what was found of the picture and of everything else, the urgent included.
+        """Return all findings of a tick, after the action expert, the urgent ones included.
 
-        `driven_ns`: when the picture that is driven by was captured; `last_tick_ns`: how long the last tick took.
+        `driven_ns`: capture stamp of the picture in use; `last_tick_ns`: duration of the last tick.
         """
         sources = self._sources
         return (

@@ -101,7 +101,7 @@ def cut(directory: Path, name: str) -> None:
 
 
 DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
-    "a truncated file": (lambda d: cut(d, "action_expert.onnx"), r"action_expert.onnx: \d+ bytes, the manifest says"),
+    "a truncated file": (lambda d: cut(d, "action_expert.onnx"), r"action_expert.onnx: \d+ bytes, the manifest lists"),
     "a missing file": (lambda d: (d / "tokenizer.json").unlink(), r"tokenizer.json: missing"),
     "a file that is not listed": (lambda d: (d / "weights.pkl").write_bytes(b"\x80\x04"), "not listed"),
     "a symlink": (lambda d: link_to_outside(d, "tokenizer.json"), "not a regular file"),

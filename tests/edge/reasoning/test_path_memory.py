@@ -17,8 +17,8 @@ from edge.reasoning.path_memory import (
     PERIOD_NS,
     PathMemory,
     Point,
+    past_path_of,
     simplified,
-    way_of,
 )
 
 TICK_NS = 100_000_000
@@ -77,7 +77,7 @@ def test_a_way_out_and_back_is_told_with_its_far_end() -> None:
 
 
 def test_a_corner_is_told_as_the_start_and_the_corner_in_the_newest_robot_frame() -> None:
-    way = way_of(corner())
+    way = past_path_of(corner())
     # 20 s at 0.8 m/s straight on, then 16 m to the left of it: now the start is 17 m behind and as far to the left.
     assert len(way) == 2
     assert way[0] == pytest.approx((-16.8, 16.8), abs=0.3)
@@ -85,18 +85,18 @@ def test_a_corner_is_told_as_the_start_and_the_corner_in_the_newest_robot_frame(
 
 
 def test_a_straight_way_is_its_start() -> None:
-    assert way_of(drive([0.0] * 101)) == ((-8.0, 0.0),)
+    assert past_path_of(drive([0.0] * 101)) == ((-8.0, 0.0),)
 
 
 def test_the_first_telling_is_the_start_and_without_any_pose_there_is_no_way() -> None:
-    assert way_of(drive([0.0])) == ((0.0, 0.0),)
-    assert way_of([]) == ()
+    assert past_path_of(drive([0.0])) == ((0.0, 0.0),)
+    assert past_path_of([]) == ()
 
 
 @given(turns)
 def test_a_way_has_at_most_8_points_of_tenths_and_begins_at_the_start(turning: list[float]) -> None:
     poses = drive(turning)
-    way = way_of(poses)
+    way = past_path_of(poses)
     assert 1 <= len(way) <= MAX_POINTS
     start = poses[-1][1].inverse() @ poses[0][1]
     assert way[0] == pytest.approx((start.x_m, start.y_m), abs=0.051)
@@ -112,7 +112,7 @@ def test_the_way_is_the_same_however_many_poses_come_at_once(turning: list[float
     for end in range(at_once, len(poses) + at_once, at_once):
         for stamp_ns, T_odom_base in poses[max(0, end - 30) : end]:
             memory.put(stamp_ns, T_odom_base)
-    assert memory.way(poses[-1][1]) == way_of(poses)
+    assert memory.past_path(poses[-1][1]) == past_path_of(poses)
 
 
 @given(turns, st.tuples(metres, metres, st.floats(-3, 3)))
@@ -121,8 +121,8 @@ def test_the_start_is_told_alike_wherever_odometry_has_its_origin(
 ) -> None:
     poses = drive(turning)
     T_new_old = SE2(*moved)
-    elsewhere = way_of((stamp_ns, T_new_old @ T_odom_base) for stamp_ns, T_odom_base in poses)
-    assert elsewhere[0] == pytest.approx(way_of(poses)[0], abs=0.11)
+    elsewhere = past_path_of((stamp_ns, T_new_old @ T_odom_base) for stamp_ns, T_odom_base in poses)
+    assert elsewhere[0] == pytest.approx(past_path_of(poses)[0], abs=0.11)
 
 
 def test_a_robot_that_stands_keeps_nothing_new() -> None:
@@ -141,11 +141,11 @@ def test_hours_are_bounded_and_the_start_is_never_lost() -> None:
         most = max(most, len(memory.points))
     assert most < CAPACITY
     assert memory.points[0] == (poses[0][1].x_m, poses[0][1].y_m)
-    assert memory.way(poses[-1][1])[0] == pytest.approx(way_of([poses[0], poses[-1]])[0])
+    assert memory.past_path(poses[-1][1])[0] == pytest.approx(past_path_of([poses[0], poses[-1]])[0])
 
 
 def test_what_is_told_of_a_way_beyond_a_kilometre_has_a_bound() -> None:
-    assert way_of([(0, SE2(-5000.0, 2.0, 0.0)), (PERIOD_NS, SE2(0.0, 0.0, 0.0))]) == ((-FARTHEST_M, 2.0),)
+    assert past_path_of([(0, SE2(-5000.0, 2.0, 0.0)), (PERIOD_NS, SE2(0.0, 0.0, 0.0))]) == ((-FARTHEST_M, 2.0),)
 
 
 def test_a_pose_that_is_not_newer_changes_nothing() -> None:
@@ -153,4 +153,4 @@ def test_a_pose_that_is_not_newer_changes_nothing() -> None:
     memory.put(5 * PERIOD_NS, SE2(1.0, 0.0, 0.0))
     memory.put(5 * PERIOD_NS, SE2(9.0, 9.0, 0.0))
     memory.put(3 * PERIOD_NS, SE2(9.0, 9.0, 0.0))
-    assert memory.way(SE2(2.0, 0.0, 0.0)) == ((-1.0, 0.0),)
+    assert memory.past_path(SE2(2.0, 0.0, 0.0)) == ((-1.0, 0.0),)

@@ -12,9 +12,9 @@ from edge.core.geometry import SE2
 from edge.reasoning.path_memory import Point
 from edge.reasoning.prompt import (
     EXAMPLE_BEFORE,
-    EXAMPLE_WAY,
+    EXAMPLE_PAST_PATH,
     LONGEST_BEFORE,
-    LONGEST_WAY,
+    LONGEST_PAST_PATH,
     InstructionError,
     PromptBuilder,
     PromptIds,
@@ -81,20 +81,22 @@ def length(segments: list[Segment]) -> int:
 
 
 def test_the_longest_nano_prompt_with_four_frames_leaves_room_to_answer(builder: PromptBuilder) -> None:
-    longest = length(builder.build(FRAMES, " ".join(["turn left at the sign."] * 15), LONGEST_WAY, LONGEST_BEFORE))
+    longest = length(
+        builder.build(FRAMES, " ".join(["turn left at the sign."] * 15), LONGEST_PAST_PATH, LONGEST_BEFORE)
+    )
     assert longest + 72 <= PRESETS["nano"].language.max_context
 
 
 def test_a_plan_counts_as_many_text_tokens_as_a_usual_prompt_has(builder: PromptBuilder) -> None:
     instruction = "walk down the corridor and stop at the vending machine"
-    prompt = builder.build(FRAMES, instruction, EXAMPLE_WAY, EXAMPLE_BEFORE)
+    prompt = builder.build(FRAMES, instruction, EXAMPLE_PAST_PATH, EXAMPLE_BEFORE)
     assert length(prompt) - 4 * 16 == TEXT_TOKENS[False]
 
 
 @given(st.lists(st.tuples(tenths, tenths), max_size=8), st.integers(1, 99), st.integers(0, 99))
 def test_no_way_and_no_progress_is_longer_than_the_longest(points: list[Point], step: int, passed: int) -> None:
     tail = BUILDER.tail(tuple(points), Progress(step, 99, passed))
-    assert len(tail.ids) <= len(BUILDER.tail(LONGEST_WAY, LONGEST_BEFORE).ids)
+    assert len(tail.ids) <= len(BUILDER.tail(LONGEST_PAST_PATH, LONGEST_BEFORE).ids)
 
 
 @pytest.mark.parametrize("bad", ["", "  \n ", "x" * 401, "go \udcff"])

@@ -13,7 +13,7 @@ from edge.inference.generation_task import GenerationModels
 from edge.reasoning.decoding_rules import BACK, DONE, EITHER_WAY, FREE, MAX_REFUSALS, ONWARD, TurnObservation
 from edge.reasoning.generation_cycle import ReasoningBudget, ReasoningConfig
 from edge.reasoning.instruction_state import InstructionMemory
-from edge.reasoning.path_memory import PathMemory, Way, way_of
+from edge.reasoning.path_memory import PastPath, PathMemory, past_path_of
 from edge.state.reasoning_text import LEFT, RIGHT, Progress
 from edge.state.ring import EncodedFrame, TokenRing
 from edge.state.semantic import SemanticSlot, SharedState
@@ -57,7 +57,7 @@ def bench() -> Bench:
     return Bench(clock=Clock())
 
 
-def think_at(bench: Bench, second: float) -> tuple[Way, Progress | None]:
+def think_at(bench: Bench, second: float) -> tuple[PastPath, Progress | None]:
     """What a generation with a newest frame of that second is told; the robot drives at 1 m/s."""
     bench.frame(second)
     assert bench.loop.step()
@@ -158,7 +158,7 @@ def test_a_turn_comes_nearer_by_what_the_robot_has_driven_between_the_newest_fra
 def test_the_way_is_that_of_all_poses_since_the_beginning() -> None:
     for number, (way, _) in enumerate(threaded(400, 20).prompt.told):
         poses = [(frame_at(tick).stamp_ns, pose_at(tick)) for tick in range(20 * number + 1)]
-        assert way == way_of(poses)
+        assert way == past_path_of(poses)
 
 
 def test_the_way_goes_on_while_reasoning_is_paused_for_longer_than_the_ring_is_long() -> None:
@@ -170,7 +170,7 @@ def test_the_way_goes_on_while_reasoning_is_paused_for_longer_than_the_ring_is_l
     bench.budget = ReasoningBudget()
     bench.ring.put(frame_at(700))
     assert bench.loop.step()
-    assert bench.language.prompt.told == [(way_of((frame_at(t).stamp_ns, pose_at(t)) for t in range(701)), None)]
+    assert bench.language.prompt.told == [(past_path_of((frame_at(t).stamp_ns, pose_at(t)) for t in range(701)), None)]
 
 
 # An instruction's memory
@@ -282,8 +282,8 @@ def test_frames_after_the_newest_of_a_generation_are_left_for_the_next() -> None
     ring, memory = TokenRing(100), InstructionMemory(None, "")
     for tick in range(60):
         ring.put(frame_at(tick))
-    assert memory.way(ring, frame_at(30)) == way_of((frame_at(t).stamp_ns, pose_at(t)) for t in range(31))
-    assert memory.way(ring, frame_at(59)) == way_of((frame_at(t).stamp_ns, pose_at(t)) for t in range(60))
+    assert memory.past_path(ring, frame_at(30)) == past_path_of((frame_at(t).stamp_ns, pose_at(t)) for t in range(31))
+    assert memory.past_path(ring, frame_at(59)) == past_path_of((frame_at(t).stamp_ns, pose_at(t)) for t in range(60))
 
 
 def test_watching_the_ring_looks_at_its_poses_once_a_second(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -73,7 +73,7 @@ def test_every_encoded_frame_is_left_for_the_reasoning_thread_with_its_pose(benc
 def test_a_bridge_that_has_gone_silent_ends_the_loop(bench: Bench) -> None:
     bench.see()
     bench.sink.silent_ns = 700_000_000
-    assert bench.loop.run(bench.now_ns, None) == "no word from it for 0.7 s"
+    assert bench.loop.run(bench.now_ns, None) == "no status from it for 0.7 s"
 
 
 def test_a_broken_action_expert_stops_the_robot_and_not_the_loop(bench: Bench) -> None:

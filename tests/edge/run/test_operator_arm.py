@@ -258,7 +258,7 @@ class TestInTheWay:
     """What the runner itself finds before arming; the bridge does not know of it."""
 
     def test_what_lasts_is_a_refusal_before_the_bridge_is_asked(self) -> None:
-        runner = Runner(Bench(), in_the_way="There is no new picture to drive by.")
+        runner = Runner(Bench(), in_the_way="There is no new picture.")
         with pytest.raises(RefusedError, match="not armed: There is no new picture"):
             runner.run()
         assert runner.asked_ms == []

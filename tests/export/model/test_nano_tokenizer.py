@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from tokenizers import Tokenizer
 
 from edge.core.geometry import SE2
-from edge.reasoning.prompt import EXAMPLE_BEFORE, EXAMPLE_WAY, PromptBuilder, PromptIds
+from edge.reasoning.prompt import EXAMPLE_BEFORE, EXAMPLE_PAST_PATH, PromptBuilder, PromptIds
 from edge.state.reasoning_text import format_waypoints
 from edge.state.ring import EncodedFrame
 from export.model.config import PRESETS
@@ -110,7 +110,7 @@ def test_a_whole_exchange_with_four_frames_has_at_most_260_tokens() -> None:
     frames = [EncodedFrame(i, SE2(0.0, 0.0, 0.0), np.zeros((1, 64, 256), dtype=np.float32)) for i in range(4)]
     builder = PromptBuilder(Tokenizer.from_file(str(NANO_TOKENIZER)), PromptIds(1, 2, 3, 4, 5), frame_tokens=16)
     lengths = [
-        sum(len(segment.ids) for segment in builder.build(frames, text, EXAMPLE_WAY, EXAMPLE_BEFORE))
+        sum(len(segment.ids) for segment in builder.build(frames, text, EXAMPLE_PAST_PATH, EXAMPLE_BEFORE))
         for text in instructions()
     ]
     assert statistics.median(lengths) + tokens(ANSWER) + 1 <= 260

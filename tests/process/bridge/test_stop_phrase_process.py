@@ -182,7 +182,7 @@ def test_the_runners_bridge_is_stopped_as_by_an_operator_and_its_run_ends(stack:
         assert done.returncode == 0, done.stderr
         assert "`edge-bridge arm`" in done.stdout
         assert runner.process.wait(20) == 1
-        assert "A stop phrase came by the instruction channel." in runner.stderr()
+        assert "The instruction channel received a stop phrase." in runner.stderr()
         assert "new instruction" not in runner.stderr()
         check_stands(stack, host, ended_ns)
     assert operate("status", stack.bridge)[1]["blocked_by"] == "estop"

@@ -17,7 +17,7 @@ from edge.inference.language import Generation
 from edge.inference.scheduling import Role
 from edge.reasoning.decoding_rules import DecodingContext, TurnObservation
 from edge.reasoning.generation_cycle import Mode, ReasoningBudget, ReasoningConfig
-from edge.reasoning.path_memory import Way
+from edge.reasoning.path_memory import PastPath
 from edge.run.reasoning_loop import ReasoningLoop, ReasoningOutputs, ReasoningSchedule
 from edge.state.reasoning_text import Progress
 from edge.state.ring import EncodedFrame, TokenRing
@@ -35,9 +35,9 @@ class FakePrompt:
         return (frame.stamp_ns / 1e9, instruction)
 
     def __init__(self) -> None:
-        self.told: list[tuple[Way, Progress | None]] = []
+        self.told: list[tuple[PastPath, Progress | None]] = []
 
-    def tail(self, way: Way, before: Progress | None) -> str:
+    def tail(self, way: PastPath, before: Progress | None) -> str:
         self.told.append((way, before))
         return "tail"
 

@@ -20,7 +20,7 @@ from tokenizers import Tokenizer
 
 from edge.core.geometry import SE2
 from edge.reasoning.decoding_rules import DecodingContext, TextConstraint
-from edge.reasoning.path_memory import FARTHEST_M, MAX_POINTS, PathMemory, Way
+from edge.reasoning.path_memory import FARTHEST_M, MAX_POINTS, PastPath, PathMemory
 from edge.reasoning.prompt import PromptBuilder, PromptIds, Segment
 from edge.state.reasoning_text import (
     MAX_COUNT,
@@ -56,7 +56,7 @@ class Anchor:
     k: int
     frames: tuple[int, ...]
     """Frames in the prompt, oldest first; the last one is k."""
-    way: Way
+    way: PastPath
     """Past motion since the instruction, from odometry."""
     wordings: tuple[str, ...]
     points: Waypoints
@@ -92,7 +92,7 @@ class Drawn:
     wording: str
     before: Progress | None
     waypoints_only: bool = False
-    way: Way | None = None
+    way: PastPath | None = None
     """Past motion with noise; None: as recorded."""
 
 
@@ -135,7 +135,7 @@ def anchors_of(drive: Drive, every: int = TRACE_EVERY) -> list[Anchor]:
                 drive_id=drive.id,
                 k=k,
                 frames=frames_at(k),
-                way=memory.way(T_odom_base),
+                way=memory.past_path(T_odom_base),
                 wordings=drive.wordings,
                 points=points,
                 reasoning=replace(reasoning, waypoints=points),
@@ -190,7 +190,7 @@ def draw(anchor: Anchor, config: DrawConfig, rng: np.random.Generator) -> Drawn:
     )
 
 
-def _noisy_way(way: Way, config: DrawConfig, noise: npt.NDArray[np.float64]) -> Way:
+def _noisy_way(way: PastPath, config: DrawConfig, noise: npt.NDArray[np.float64]) -> PastPath:
     """Add odometry noise to past motion: rotation and scale about the robot, and noise on each point."""
     turn, scale = float(noise[0, 0]) * config.way_turn_rad, 1.0 + float(noise[0, 1]) * config.way_scale
     c, s = scale * cos(turn), scale * sin(turn)
