@@ -120,7 +120,7 @@ def fsync_path(path: Path) -> None:
 
 
 @contextmanager
-def open_cache(directory: Path, limit_bytes: int, say: Callable[[str], None]) -> Iterator[StageCache]:
+def open_cache(directory: Path, limit_bytes: int, log: Callable[[str], None]) -> Iterator[StageCache]:
     """A cache to work with; afterwards the entries used longest ago go until the rest fits `limit_bytes`.
 
     Entries go only while no other process has the cache open. Raises CacheError, also for a directory of another use.
@@ -137,7 +137,7 @@ def open_cache(directory: Path, limit_bytes: int, say: Callable[[str], None]) ->
         ) from error
     try:
         fcntl.flock(descriptor, fcntl.LOCK_SH)
-        cache = StageCache(directory, say)
+        cache = StageCache(directory, log)
         try:
             yield cache
         finally:
@@ -167,7 +167,7 @@ class StageCache:
     """Finished stages in a directory, each under the hash of what it was made from; made by `open_cache`."""
 
     directory: Path
-    say: Callable[[str], None]
+    log: Callable[[str], None]
 
     def fetch_or_build(self, key: str, build: Callable[[Path], None]) -> tuple[Path, bool]:
         """Directory of a stage's files and whether they were there already; else `build` writes them.
@@ -182,7 +182,7 @@ class StageCache:
                 if damage is None:
                     os.utime(entry / ENTRY_NAME)  # its age counts from its last use
                     return entry, True
-                self.say(f"cache: {damage}; building it again")
+                self.log(f"cache: {damage}; building it again")
                 shutil.rmtree(entry)
             partial = self.directory / f"{key}.partial"
             shutil.rmtree(partial, ignore_errors=True)  # left by a process that was killed

@@ -169,7 +169,7 @@ def _write_directory(pipeline: Pipeline, directory: Path, progress: BuildProgres
             "weights_origin": weights.origin,
             "calibration": job.calibration.to_dict(),
             "packages": package_versions(),
-            "asked": asdict(job.asked),
+            "asked": asdict(job.request),
             "target": job.target.to_dict(),
         },
     }
@@ -224,7 +224,7 @@ def check_directory(pipeline: Pipeline, directory: Path, progress: BuildProgress
         result = results[name] = pipeline.gate(artifacts, name)
         require(name, result.verdict)
         if result.verdict.level == WARN:
-            progress.say(f"{name}: near a limit: {'; '.join(result.verdict.reasons)}")
+            progress.log(f"{name}: near a limit: {'; '.join(result.verdict.reasons)}")
     return results
 
 

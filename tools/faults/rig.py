@@ -39,7 +39,7 @@ class Rig:
     """The processes of one DDS domain; a context manager that ends exactly those it started."""
 
     def __init__(
-        self, folder: Path, artifacts: Path, domain: int, say: Callable[[str], None], *, record: bool = True
+        self, folder: Path, artifacts: Path, domain: int, log: Callable[[str], None], *, record: bool = True
     ) -> None:
         """Put sockets and logs into `folder`, whose path must be short: a socket's has at most 107 bytes."""
         self.folder = folder
@@ -50,7 +50,7 @@ class Rig:
         self.needs_operator = False
         self._artifacts = artifacts
         self._record = record
-        self._say = say
+        self._log = log
         self._children = Children(folder, grace_s=5.0)
         self._trace = LineTail(folder / "trace.jsonl")
         self._commanded: list[tuple[int, bool]] = []
@@ -129,7 +129,7 @@ class Rig:
             self._wait(partial(self._moving_or_ended, runner), MOVING_TIMEOUT_S, runner, "motion")
             if runner.running:
                 return
-            self._say(f"the runner ended before it was asked to: {last_line(runner)}")
+            self._log(f"the runner ended before it was asked to: {last_line(runner)}")
         raise StepError(f"the runner ended {_ATTEMPTS} times before it was asked to: {last_line(runner)}")
 
     def _moving_or_ended(self, runner: Child) -> bool:

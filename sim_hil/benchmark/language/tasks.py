@@ -27,13 +27,13 @@ _NOT_GOALS = frozenset(("notice_board", "window", "trash_bin", "medical_cart", "
 
 @dataclass(frozen=True)
 class Task:
-    """Task; `path`: shortest path from `start` to `goal`, m, for the grid's robot; `told`: its description."""
+    """Task; `path`: shortest path from `start` to `goal`, m, for the grid's robot; `route`: its description."""
 
     start: Vec3
     goal: Vec2
     goal_label: str
     path: tuple[Vec2, ...]
-    told: RouteDescription
+    route: RouteDescription
 
 
 def goal_before(grid: NavGrid, thing: SceneObject) -> Vec2 | None:
@@ -157,7 +157,7 @@ def _facing(task: Task) -> Task:
     """The same task, the robot looking where it must go; raises RouteError when the way begins beside it."""
     start = task.start
     away = _first_direction(task.path)
-    if task.told.leaves_room:  # stand so that the door is ahead
+    if task.route.leaves_room:  # stand so that the door is ahead
         return replace(task, start=(start[0], start[1], round(away, 3)))
     if abs(_wrapped(away - start[2])) > pi / 2:  # look the other way along the corridor
         start = (start[0], start[1], _wrapped(start[2] + pi))

@@ -164,7 +164,7 @@ def export_artifacts(
     weights: Path,
     config: TicVlaConfig,
     out: Path,
-    say: Callable[[str], None] = lambda line: None,
+    log: Callable[[str], None] = lambda line: None,
     command: Sequence[str] = COMMAND,
 ) -> Path:
     """Export into `out`, unless it contains these weights, and return it. Raises ExportError, KeyboardInterrupt."""
@@ -175,7 +175,7 @@ def export_artifacts(
         mark.unlink()
     out.parent.mkdir(parents=True, exist_ok=True)
     arguments = ["--target", TARGET, "--model", model_argument(config, out), "--checkpoint", str(weights)]
-    say(f"exporting the weights of stage {weights.parent.name}")
+    log(f"exporting the weights of stage {weights.parent.name}")
     log = out.with_name(out.name + ".log")
     with log.open("wb") as output:
         code = subprocess.run([*command, *arguments, "--out", str(out)], stdout=output, stderr=output, check=False)

@@ -58,7 +58,7 @@ def comb() -> Scene:
 def way() -> RouteDescription:
     scene = comb()
     machine = next(thing for thing in scene.objects if thing.label == "machine")
-    return make_task(scene, NavGrid(scene, clearance_m=0.4), (1.0, 1.2, 0.0), machine).told
+    return make_task(scene, NavGrid(scene, clearance_m=0.4), (1.0, 1.2, 0.0), machine).route
 
 
 def test_a_way_is_told_by_its_turn_its_count_and_what_it_passes(way: RouteDescription) -> None:
@@ -72,8 +72,8 @@ def test_a_way_is_told_by_its_turn_its_count_and_what_it_passes(way: RouteDescri
 def test_doors_are_counted_apart_from_corridors() -> None:
     scene = comb()
     shelf = next(thing for thing in scene.objects if thing.label == "shelf")
-    told = make_task(scene, NavGrid(scene, clearance_m=0.4), (1.0, 1.2, 0.0), shelf).told
-    (step,) = told.steps
+    route = make_task(scene, NavGrid(scene, clearance_m=0.4), (1.0, 1.2, 0.0), shelf).route
+    (step,) = route.steps
     assert (step.side, step.kind, step.ordinal) == ("right", "room", 1)
 
 
@@ -82,8 +82,8 @@ def test_a_turn_where_the_corridor_ends_is_told_as_such() -> None:
     moved = [replace(thing, position_m=(17.0, 7.4, 0.0)) if thing.label == "machine" else thing
              for thing in scene.objects]  # fmt: skip
     scene = replace(scene, objects=tuple(moved))
-    told = make_task(scene, NavGrid(scene, clearance_m=0.4), (1.0, 1.2, 0.0), moved[0]).told
-    assert (told.steps[0].ordinal, told.steps[0].at_end) == (3, True)
+    route = make_task(scene, NavGrid(scene, clearance_m=0.4), (1.0, 1.2, 0.0), moved[0]).route
+    assert (route.steps[0].ordinal, route.steps[0].at_end) == (3, True)
 
 
 def test_a_start_right_beside_an_opening_that_counts_is_refused() -> None:
@@ -120,7 +120,7 @@ def tee(door_x: float) -> Scene:
 def told_in_tee(door_x: float, goal: str) -> RouteDescription:
     scene = tee(door_x)
     thing = next(thing for thing in scene.objects if thing.label == goal)
-    return make_task(scene, NavGrid(scene, clearance_m=0.4), (5.0, 1.0, pi / 2), thing).told
+    return make_task(scene, NavGrid(scene, clearance_m=0.4), (5.0, 1.0, pi / 2), thing).route
 
 
 def test_a_door_straight_across_from_where_one_comes_out_is_counted_by_some_and_refused() -> None:
@@ -238,8 +238,8 @@ def drawn(request: pytest.FixtureRequest) -> list[Task]:
 def test_training_scenes_yield_tasks_whose_wordings_are_true(drawn: list[Task]) -> None:
     assert len(drawn) == 3
     for index, task in enumerate(drawn):
-        for text in wordings(task.told, 6, index, held_out=False):
-            assert untrue(text, task.told) == [], text
+        for text in wordings(task.route, 6, index, held_out=False):
+            assert untrue(text, task.route) == [], text
 
 
 @pytest.mark.slow
