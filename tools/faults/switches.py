@@ -1,4 +1,4 @@
-"""Faults of a process of ours, switched through a local socket, which answers with the time of the effect."""
+"""Faults of a process, switched through a local socket, which answers with the time of the effect."""
 
 from __future__ import annotations
 
