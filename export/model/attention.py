@@ -64,7 +64,10 @@ class CrossAttentionLayer(nn.Module):
         self.fc2 = nn.Linear(ffn, hidden)
 
     def forward(self, x: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None = None) -> Tensor:
-        """Attend with queries [B, S, hidden] to keys, values [B, heads, T, d]; `mask` [B, 1, 1, T]: False at padding."""
+        """Attend from queries [B, S, hidden] to keys and values [B, heads, T, d].
+
+        `mask` [B, 1, 1, T] is False at padding.
+        """
         n, t, d = x.shape
         q = self.q(self.norm1(x)).reshape(n, t, self.heads, d // self.heads).transpose(1, 2)
         attended = F.scaled_dot_product_attention(q, keys, values, attn_mask=mask)

@@ -1,4 +1,4 @@
-"""PyTorch and transformers, eager: our encoder and unsplit action expert, and Qwen2ForCausalLM."""
+"""Worker of eager PyTorch and transformers: encoder, unsplit action expert, and Qwen2ForCausalLM."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FORMS = ("fp32", "bf16", "int8")
 
 
 def in_form(module: nn.Module, form: str) -> nn.Module:
-    """The module in bf16, or with dynamically quantised linear layers."""
+    """Convert the module to bf16, or quantise its linear layers dynamically."""
     if form not in FORMS:
         raise ValueError(f"form {form!r}: expected one of {FORMS}")
     if form == "int8":
