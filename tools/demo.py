@@ -282,7 +282,7 @@ def parser() -> argparse.ArgumentParser:
 
 @command_line("demo")
 def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]] = COMMANDS) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     args = parser().parse_args(argv)
     try:
         domain = free_domain() if args.domain is None else args.domain

@@ -163,7 +163,7 @@ def _run(artifacts: Path, duration_s: float, folder: Path) -> tuple[list[Tick], 
 
 @command_line("contention")
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     arguments = sys.argv[1:] if argv is None else argv
     if arguments[:1] == [DRIVE]:
         return drive(arguments[1:])

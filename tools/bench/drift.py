@@ -301,7 +301,7 @@ def _table(summary: dict[str, Any]) -> str:
 
 @command_line("drift")
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     p = command_parser(__doc__)
     p.add_argument("--walks", type=int, default=50, metavar="N", help="walks, each at both levels (default 50)")
     p.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the first walk (default 0)")

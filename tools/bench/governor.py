@@ -235,7 +235,7 @@ def judge(load: str, run: Run, budget_w: float, period_s: float = 0.1) -> dict[s
 
 @command_line("governor")
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     p = command_parser(__doc__)
     p.add_argument("--seconds", type=float, default=LENGTH_S, help="modelled length of each run (default: 600)")
     p.add_argument("--seed", type=int, default=0, help="seed of noise and texts (default: 0)")

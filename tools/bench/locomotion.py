@@ -143,7 +143,7 @@ def _speeds(speeds: Sequence[Speed]) -> dict[int, list[Speed]]:
 
 @command_line("locomotion")
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     p = command_parser(__doc__)
     p.add_argument("--rate", type=int, default=500, metavar="HZ", help="steps of physics a second (default 500)")
     p.add_argument(

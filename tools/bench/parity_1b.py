@@ -290,7 +290,7 @@ def show(result: dict[str, Any]) -> None:
 
 @command_line("parity_1b")
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     p = command_parser(__doc__)
     p.add_argument("--model", default="1b", help="1b, or a .json file with InternVL3's vocabulary")
     p.add_argument("--frames", type=int, default=4)

@@ -88,7 +88,7 @@ def profile(artifacts: Artifacts, name: str, *, context: int, threads: int) -> d
 
 @command_line("profile")
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     p = command_parser(__doc__, artifacts=True)
     p.add_argument("--graphs", nargs="*", metavar="NAME", help="graphs to profile (default: all)")
     p.add_argument("--context", type=int, default=1100, help="tokens before the new one (default: 1100)")

@@ -265,7 +265,7 @@ def checked(args: argparse.Namespace) -> Bench:
 
 @command_line("runtimes")
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     args = arguments(argv)
     try:
         bench = checked(args)

@@ -86,7 +86,7 @@ def stop_once(children: Children, runner: list[str], trace: Path, number: signal
 
 @command_line("stop")
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     p = command_parser(__doc__, artifacts=True)
     p.add_argument("--runs", type=int, default=20, help="runs of each signal (default: 20)")
     args = p.parse_args(argv)

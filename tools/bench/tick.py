@@ -58,7 +58,7 @@ def torch_tick(model_name: str, image: NDArray[np.uint8], kv: NDArray[np.float32
 
 @command_line("tick")
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     p = command_parser(__doc__, artifacts=True)
     p.add_argument("--rounds", type=int, default=100)
     p.add_argument("--tokens", type=int, default=200, help="tokens of the semantic state (default: 200)")

@@ -158,7 +158,7 @@ def keep_logs(folder: Path, out: Path) -> None:
 
 @command_line("faults")
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     args = parser().parse_args(argv)
     try:
         wanted = chosen(args.rows)

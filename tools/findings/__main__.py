@@ -90,7 +90,7 @@ def parser() -> argparse.ArgumentParser:
 
 @command_line(COMMAND, {ArtifactError: EXIT_REFUSED, **dict.fromkeys(_BAD_INPUT, EXIT_BAD_INPUT)})
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     args = parser().parse_args(argv)
     try:
         return _main(args)

@@ -81,7 +81,7 @@ def _recipe(run: Path) -> Recipe:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Command line."""
+    """Return the argument parser."""
     p = argparse.ArgumentParser(
         "python -m tools.findings.models", description=__doc__, epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -94,7 +94,7 @@ def parser() -> argparse.ArgumentParser:
 
 @command_line("findings-models", _EXITS)
 def main(argv: Sequence[str] | None = None, command: Sequence[str] = COMMAND) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     args = parser().parse_args(argv)
     models = list(models_of(args.run, args.ablations))
     if not models:

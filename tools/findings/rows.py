@@ -215,7 +215,7 @@ def at_mean(base: LatencyProfile, mean_s: float) -> LatencyProfile:
 
 
 def located(root: Path, variant: str) -> tuple[Path, str | None]:
-    """(policy's directory, --variant) of a model; a root that is one directory of artifacts is the shipped model's.
+    """Return a model's (policy directory, --variant); a root that is one artifact directory is the shipped model.
 
     Raises ConditionsError.
     """

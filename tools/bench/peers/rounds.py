@@ -186,7 +186,7 @@ class Round:
         return max([self.idle_foreign_cores, *(s.foreign_cores for s in self.samples)]) <= FOREIGN_CORES
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON form."""
+        """Return the plain JSON form."""
         return {**asdict(self), "quiet": self.quiet}
 
 

@@ -135,7 +135,7 @@ class Course:
             self._slab(top + PLATEAU_M + run / 2, rise / 2, RAMP_RAD)
 
     def _slab(self, x_m: float, z_m: float, pitch_rad: float) -> None:
-        """A slab 1 m thick of a ramp's length whose top is centred on (x, 0, z)."""
+        """Add a slab 1 m thick with a ramp's length; its top is centred on (x, 0, z)."""
         centre = (x_m - 0.5 * sin(pitch_rad), 0.0, z_m - 0.5 * cos(pitch_rad))
         self._box(centre, (RAMP_LENGTH_M, 12.0, 1.0), pitch_rad)
 

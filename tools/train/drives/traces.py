@@ -106,9 +106,9 @@ class Tracer:
     def trace(
         self, pose: SE2, people: Array, velocities: Array, plan_xy: Sequence[Sequence[float]] | None = None
     ) -> ReasoningText:  # fmt: skip
-        """Of a true pose, people [n, 2 or 3] (x m, y m, ...) and their velocities [n, 2], m/s, in the world.
+        """Describe the scene at a true pose among people [n, 2 or 3] (x m, y m, ...) with world velocities [n, 2], m/s.
 
-        `plan_xy`: where the robot means to be in 3 s (and later), m in its own frame; only by it one sees it wait.
+        `plan_xy`: planned positions in 3 s (and later), m in the robot frame; without them waiting is not detected.
         """
         crowd = self._people_in_view(pose, people)
         progress, step = self.progress.at(pose), self.progress.next_step(pose)

@@ -126,7 +126,7 @@ def run(job: StageJob) -> dict[str, Any]:
         mirror = TokenCache(SecondsDataset.of(dataset, mirrored=True), network.vision, dataset.folder / MIRRORED)
         _encode(job, mirror, dataset.train)
     job = replace(job, recipe=replace(job.recipe, sft=replace(config, epochs=epochs, optim=optim)))
-    more = _retold(job, dataset) if config.retold.ways else []
+    more = _relabelled(job, dataset) if config.retold.ways else []
     views = Views(plain, mirror)
     if config.tours.count:
         tours = _tours(job, dataset)
@@ -274,7 +274,7 @@ def _with_tours(job: StageJob, network: TicVla, views: Views, tours: Dataset) ->
     return Views(views.plain, mirror, seconds)
 
 
-def _retold(job: StageJob, dataset: Dataset) -> list[Anchor]:
+def _relabelled(job: StageJob, dataset: Dataset) -> list[Anchor]:
     """Return the anchors of relabelled training drives; missing relabels are computed."""
     recipe = job.recipe
     relabels = InstructionRelabels(dataset, recipe.sft.retold, recipe.seed, recipe.collect.speed_mps)

@@ -59,7 +59,7 @@ def make(folder: Path, content: dict[str, Any], fill: Callable[[Path], None]) ->
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument("--model", required=True)
     p.add_argument("--cache", type=Path, required=True, metavar="DIR")
