@@ -64,7 +64,7 @@ def write_findings(
 
 def markdown(content: Mapping[str, Any], judged: Sequence[Judged], pictures: Sequence[Path]) -> str:
     """Render the page."""
-    lines = ["# Findings", "", f"Suite `{content['suite']}`, {content['asked']} episodes asked for, latency ", ""]
+    lines = ["# Findings", "", f"Suite `{content['suite']}`, {content['asked']} episodes requested, latency ", ""]
     lines[2] += f"{content['latency']}.{'' if content['trained'] else ' **The weights are untrained.**'}"
     lines += [
         HOW,

@@ -105,7 +105,7 @@ def _gain(
     first: list[float] = [0.0] * len(order)
     second: list[float] = [0.0] * len(order)
     for names in pairs:
-        compare(results[names[0]], results[names[1]])  # raises where one name stands for two episodes
+        compare(results[names[0]], results[names[1]])  # raises if one name means two different episodes
         for side, name in ((first, names[0]), (second, names[1])):
             by_id = {each.id: each for each in results[name]}
             for index, episode_id in enumerate(order):

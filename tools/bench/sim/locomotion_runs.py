@@ -46,8 +46,8 @@ ROUTES: Final[dict[str, tuple[str, tuple[tuple[Command, float], ...], Command, f
     "ramp turning": ("ramp", (((0.6, 0.0, 0.0), 7.5), ((0.0, 0.0, 0.6), 1.0)), (0.0, 0.0, 0.6), 2 * pi / 0.6),
 }  # fmt: skip
 PUSH_S: Final = 0.1
-# (name, command while pushed, force in the world frame, N; the robot looks along x): small ones it takes, large ones
-# topple it.
+# (name, command while pushed, force in the world frame, N; the robot faces x). It withstands small pushes and falls
+# after large ones.
 PUSHES: Final[tuple[tuple[str, Command, tuple[float, float, float], bool], ...]] = (
     ("standing, from the side", (0.0, 0.0, 0.0), (0.0, 80.0, 0.0), False),
     ("standing, from behind", (0.0, 0.0, 0.0), (100.0, 0.0, 0.0), False),

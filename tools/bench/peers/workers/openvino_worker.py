@@ -65,7 +65,7 @@ def compiled(core: ov.Core, request: Load, part: str) -> ov.CompiledModel:
 
 
 def load(request: Load) -> Mapping[str, Task]:
-    """Open the parts asked for."""
+    """Open the requested parts."""
     workload, core = Workload(request.model), ov.Core()
     tasks: dict[str, Task] = {}
     if "encoder" in request.parts:

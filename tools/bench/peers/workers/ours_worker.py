@@ -47,7 +47,7 @@ def language(workload: Workload, artifacts: Artifacts, threads: int) -> Task:
 
 
 def load(request: Load) -> Mapping[str, Task]:
-    """Open the parts asked for."""
+    """Open the requested parts."""
     workload = Workload(request.model)
     artifacts = load_artifacts(Path(request.options["artifacts"]))
     tasks: dict[str, Task] = {}

@@ -56,7 +56,7 @@ class Decoder:
 
 
 def load(request: Load) -> Mapping[str, Task]:
-    """Open the parts asked for."""
+    """Open the requested parts."""
     torch.set_num_threads(request.threads)
     workload, reference = Workload(request.model), request.cache / request.model / "reference"
     form = {part: request.options.get(f"{part}.form", "bf16") for part in request.parts}
