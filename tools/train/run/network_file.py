@@ -176,13 +176,13 @@ def export_artifacts(
     out.parent.mkdir(parents=True, exist_ok=True)
     arguments = ["--target", TARGET, "--model", model_argument(config, out), "--checkpoint", str(weights)]
     log(f"exporting the weights of stage {weights.parent.name}")
-    log = out.with_name(out.name + ".log")
-    with log.open("wb") as output:
+    log_path = out.with_name(out.name + ".log")
+    with log_path.open("wb") as output:
         code = subprocess.run([*command, *arguments, "--out", str(out)], stdout=output, stderr=output, check=False)
     if code.returncode == EXIT_INTERRUPTED:
         raise KeyboardInterrupt
     if code.returncode != EXIT_DONE:
-        lines = last_lines(log) or [f"see {log}"]
+        lines = last_lines(log_path) or [f"see {log_path}"]
         raise ExportError(f"{weights}: edge-export ended with {code.returncode}: {lines[-1]}")
     write_whole(mark, json.dumps({"weights_sha256": digest}) + "\n")
     return out
