@@ -121,10 +121,9 @@ def fsync_path(path: Path) -> None:
 
 @contextmanager
 def open_cache(directory: Path, limit_bytes: int, log: Callable[[str], None]) -> Iterator[StageCache]:
-    """Open a cache; on exit, delete the least recently used entries until the rest fits `limit_bytes`.
+    """Open the cache. On exit, remove the least recently used entries until the rest fits `limit_bytes`.
 
-    Nothing is deleted while another process has the cache open. Raises CacheError, also if the directory holds other
-    files.
+    Entries are removed only if no other process has the cache open. Raises CacheError, also for a foreign folder.
     """
     try:
         directory.mkdir(parents=True, exist_ok=True)
@@ -215,7 +214,7 @@ class StageCache:
         return {k: float(v) for k, v in pairs if isinstance(v, int | float) and not isinstance(v, bool) and v >= 0}
 
     def remember_timings(self, run: str, seconds: Mapping[str, float]) -> None:
-        """Store the stages' build times, s, for the next run's estimate."""
+        """Store the durations (s) of the built stages, for the next run's estimate only."""
         content = self._all_timings()
         content[run] = {**self.timings(run), **{k: round(v, 3) for k, v in seconds.items()}}
         write_whole(self.directory / _TIMINGS_NAME, json.dumps(content, indent=1, sort_keys=True) + "\n")

@@ -45,7 +45,7 @@ class Load:
         return {key.partition(".")[2]: v for key, v in self.options.items() if key.startswith(part + ".")}
 
     def folder(self, runtime: str, part: str) -> Path:
-        """Return the folder of a runtime's model of a part in the form of the options (see `models.prepare`)."""
+        """Return the folder in which `models.prepare` has put a runtime's model of a part, in the options' form."""
         return self.cache / self.model / runtime / f"{part}-{self.options[part + '.form']}"
 
 
