@@ -1,4 +1,4 @@
-"""`edge-export`: build verified artifacts for a target, or verify what is there."""
+"""`edge-export`: build verified artifacts for a target, or verify existing ones."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from export.model.config import PRESETS, ModelConfigError, TicVlaConfig, config_
 from export.model.weights import WeightsError, save_weights
 from export.pipeline.artifacts import build_artifacts, check_replaceable, verify_directory
 from export.pipeline.build import build_stages
-from export.pipeline.job import Asked, Job, WeightSource, job_of
+from export.pipeline.job import ExportRequest, Job, WeightSource, job_of
 from export.plan.plan import PlanError, plan
 from export.plan.table import plan_lines, plan_table
 from export.targets.file import Target, list_targets, load_target, with_settings
@@ -52,8 +52,8 @@ EXAMPLES = """examples:
   edge-export verify out/nano
   edge-export --list-targets
 
-exit codes: 0 done, 1 a graph is not the same model, a plan does not fit or an artifact is damaged,
-            2 bad arguments or input, 130 interrupted (what was finished is kept in the cache)
+exit codes: 0 done, 1 a graph fails its gates, a plan does not fit or an artifact is damaged,
+            2 bad arguments or input, 130 interrupted (finished stages stay in the cache)
 """
 EXPORT_ONLY = {
     "target": "--target",
@@ -63,20 +63,20 @@ EXPORT_ONLY = {
     "dry_run": "--dry-run",
     "save_weights": "--save-weights",
 }
-"""What `verify` has no use for: it takes all of it from the directory."""
+"""Options that `verify` refuses, because it reads their values from the directory."""
 BAD_INPUT = (ArtifactError, CalibrationError, ModelConfigError, WeightsError, TargetError, OSError)
 
 
 class UsageError(ValueError):
-    """Arguments that do not go together."""
+    """Missing or contradictory arguments."""
 
 
 def parser() -> argparse.ArgumentParser:
-    """Command line of `edge-export`."""
+    """Return the argument parser of `edge-export`."""
     p = argparse.ArgumentParser(
         COMMAND, description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    p.add_argument("command", nargs="?", choices=["verify"], help="verify DIR: hashes, contract and gates once more")
+    p.add_argument("command", nargs="?", choices=["verify"], help="verify DIR: check hashes, contract and gates again")
     p.add_argument("directory", nargs="?", type=Path, metavar="DIR", help="directory for verify")
     p.add_argument("--target", metavar="NAME|FILE.toml", help="device to export for (default: cpu)")
     p.add_argument("--list-targets", action="store_true", help="list the targets and exit")
@@ -93,8 +93,8 @@ def parser() -> argparse.ArgumentParser:
         "--random-weights",
         type=int,
         metavar="SEED",
-        help="untrained weights of this seed (default: the weights that ship, else 0), or for an action expert that no "
-        "--checkpoint has",
+        help="untrained weights of this seed (default: the shipped weights, else seed 0); with --checkpoint, only for "
+        "an action expert that the checkpoint lacks",
     )
     p.add_argument("--save-weights", type=Path, metavar="PATH", help="also write the weights as safetensors")
     p.add_argument("--calibration", metavar="NAME", help="calibration set, folder:PATH or video:PATH")
@@ -109,14 +109,14 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--out", type=Path, metavar="DIR", help="artifact directory to write")
     p.add_argument("--dry-run", action="store_true", help="print the plan and build nothing")
     cache = p.add_mutually_exclusive_group()
-    cache.add_argument("--cache", type=Path, metavar="DIR", help="where finished stages are kept")
-    cache.add_argument("--no-cache", action="store_true", help="keep nothing, use nothing")
-    p.add_argument("--cache-gb", type=float, default=20.0, metavar="GB", help="size the cache is cut to (default: 20)")
+    cache.add_argument("--cache", type=Path, metavar="DIR", help="cache of finished stages")
+    cache.add_argument("--no-cache", action="store_true", help="neither read nor write a cache")
+    p.add_argument("--cache-gb", type=float, default=20.0, metavar="GB", help="largest size of the cache (default: 20)")
     p.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     return p
 
 
-def _say(line: str) -> None:
+def _log(line: str) -> None:
     sys.stderr.write(f"{COMMAND}: {line}\n")
 
 
@@ -125,14 +125,14 @@ def _target_and_config(args: argparse.Namespace) -> tuple[Target, TicVlaConfig]:
     return with_settings(load_target(args.target or DEFAULT_TARGET, config.name), args.settings), config
 
 
-def _asked(args: argparse.Namespace) -> Asked:
+def _request(args: argparse.Namespace) -> ExportRequest:
     target, model = args.target or DEFAULT_TARGET, args.model or DEFAULT_MODEL
     shipped = target if target in list_targets() else None
-    return Asked(shipped, model if model in PRESETS else None, tuple(args.settings))
+    return ExportRequest(shipped, model if model in PRESETS else None, tuple(args.settings))
 
 
 def _check_plan(target: Target, config: TicVlaConfig, args: argparse.Namespace) -> None:
-    """Refuse at once what cannot fit; with --dry-run, print the plan."""
+    """Refuse a plan that does not fit, before anything is built; with --dry-run, print the plan first."""
     try:
         made = plan(target, config)
     except PlanError as error:
@@ -158,19 +158,19 @@ def _export(args: argparse.Namespace) -> dict[str, Any] | None:
         return None
     out = Path(os.path.realpath(args.out))
     if not out.name:
-        raise UsageError(f"--out {out}: expected a directory that can be made")
+        raise UsageError(f"--out {out}: expected a directory that can be created")
     for option, path in (("--save-weights", args.save_weights), ("--json", args.json)):
         if path is None or str(path) == "-":
             continue
         real = Path(os.path.realpath(path))
         if real == out or out in real.parents:
             raise UsageError(
-                f"{option} {path}: lies inside --out, which is replaced as a whole; name a place outside it"
+                f"{option} {path}: lies inside --out, which is replaced as a whole; name a path outside it"
             )
         check_result_target(str(path), option)
     check_replaceable(out)
     weights = WeightSource(config, args.checkpoint, args.random_weights)
-    job = Job(target, weights, load_calibration(args.calibration or DEFAULT_CALIBRATION), _asked(args))
+    job = Job(target, weights, load_calibration(args.calibration or DEFAULT_CALIBRATION), _request(args))
     with _cache(args, out.parent) as cache:
         run = f"{target.name} {config.name}"
         progress = BuildProgress(COMMAND, build_stages(job, cache.timings(run)))
@@ -184,23 +184,23 @@ def _export(args: argparse.Namespace) -> dict[str, Any] | None:
         finally:
             cache.remember_timings(run, progress.built_s)
     if not report["model"]["trained"]:
-        _say("weights are untrained: the robot will move, it will not navigate")
+        _log("the weights are untrained: the robot will move but not navigate")
     return {**_result(report), "out": str(args.out), "stage_s": progress.built_s}
 
 
 def _verify(args: argparse.Namespace) -> dict[str, Any]:
     if args.directory is None:
-        raise UsageError("verify: which directory? expected: edge-export verify DIR")
+        raise UsageError("verify: the directory is missing; expected: edge-export verify DIR")
     ignored = [option for name, option in EXPORT_ONLY.items() if getattr(args, name)]
     if ignored:
-        raise UsageError(f"verify: {ignored[0]} has no effect on what is there; leave it out")
+        raise UsageError(f"verify: {ignored[0]} has no effect on existing artifacts; leave it out")
     if not args.directory.is_dir():
-        raise UsageError(f"verify {args.directory}: not a directory; make one with edge-export --out")
+        raise UsageError(f"verify {args.directory}: not a directory; create it with edge-export --out")
     check_result_target(args.json)
     load_artifacts(args.directory)
     job, notes = job_of(args.directory, args.checkpoint, args.random_weights, args.calibration)
     for note in notes:
-        _say(note)
+        _log(note)
     with _cache(args, None) as cache:
         run = f"verify {job.target.name} {job.config.name}"
         progress = BuildProgress(COMMAND, build_stages(job, cache.timings(run), graphs=False))
@@ -220,11 +220,11 @@ def _cache(args: argparse.Namespace, beside: Path | None) -> Iterator[StageCache
             beside.mkdir(parents=True, exist_ok=True)
         with (
             tempfile.TemporaryDirectory(prefix=".edge-export-", dir=beside) as directory,
-            open_cache(Path(directory), limit_bytes, _say) as cache,
+            open_cache(Path(directory), limit_bytes, _log) as cache,
         ):
             yield cache
         return
-    with open_cache(args.cache or default_cache_dir(os.environ), limit_bytes, _say) as cache:
+    with open_cache(args.cache or default_cache_dir(os.environ), limit_bytes, _log) as cache:
         yield cache
 
 
@@ -238,10 +238,10 @@ def _result(report: dict[str, Any]) -> dict[str, Any]:
 
 @command_line("edge-export")
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run `edge-export` and return its exit code."""
     args = parser().parse_args(argv)
     started_ns = time.monotonic_ns()
-    # Told to end, it ends as on Ctrl-C: what is half-written goes, what is finished stays.
+    # SIGTERM ends the export like Ctrl-C: partial output is deleted, finished stages stay in the cache.
     previous = signal.signal(signal.SIGTERM, _interrupt)
     try:
         return _main(args, started_ns)
@@ -265,20 +265,20 @@ def _main(args: argparse.Namespace, started_ns: int) -> int:
             result["wall_s"] = (time.monotonic_ns() - started_ns) / 1e9
             write_result(args.json, result)
     except (GateError, PlanError) as error:
-        _say(str(error) if args.command == "verify" or args.dry_run else f"{error}; nothing was written")
+        _log(str(error) if args.command == "verify" or args.dry_run else f"{error}; nothing was written")
         return EXIT_CHECK_FAILED
     except (UsageError, *BAD_INPUT) as error:
-        _say(str(error))
+        _log(str(error))
         # An artifact that does not verify is a failed check; anything else here is bad input.
         return EXIT_CHECK_FAILED if args.command == "verify" and isinstance(error, ArtifactError) else EXIT_BAD_INPUT
     except KeyboardInterrupt:
-        _say(f"interrupted; {'nothing was kept' if args.no_cache else 'finished stages are in the cache'}")
+        _log(f"interrupted; {'nothing was kept' if args.no_cache else 'finished stages are in the cache'}")
         return EXIT_INTERRUPTED
     if result is not None and args.json != "-":
         for name, graph in result["graphs"].items():
             parity = graph["parity"]
-            _say(f"{name}: {graph['params']:,} parameters, cosine {parity['cosine']:.7f}, {parity['verdict']}")
-        _say(f"{result['wall_s']:.1f} s, peak memory {result['peak_rss_bytes'] / 1e9:.2f} GB")
+            _log(f"{name}: {graph['params']:,} parameters, cosine {parity['cosine']:.7f}, {parity['verdict']}")
+        _log(f"{result['wall_s']:.1f} s, peak memory {result['peak_rss_bytes'] / 1e9:.2f} GB")
     return EXIT_DONE
 
 

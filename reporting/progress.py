@@ -82,7 +82,7 @@ class Progress:
         if self._live is not None:
             self._live.stop()
 
-    def say(self, line: str) -> None:
+    def log(self, line: str) -> None:
         """Print a line; on a terminal above the status."""
         self._console.print(self._prefix + line)
 
@@ -108,7 +108,7 @@ class Progress:
         due = self._printed_ns is None or (now_ns - self._printed_ns) / 1e9 >= self._period_s
         if (due or now) and (line := self._line()):
             self._printed_ns = now_ns
-            self.say(line)
+            self.log(line)
 
     def _line(self) -> str:
         status = self._describe()
@@ -173,9 +173,9 @@ class BuildProgress:
     def __exit__(self, *_: object) -> None:
         self._display.__exit__()
 
-    def say(self, line: str) -> None:
-        """Print a line; on a terminal above the live one."""
-        self._display.say(line)
+    def log(self, line: str) -> None:
+        """Print a line; on a terminal above the status."""
+        self._display.log(line)
 
     def detail(self, text: str) -> None:
         """Set what the stage is doing, for the status."""
@@ -194,7 +194,7 @@ class BuildProgress:
         took_s = (time.monotonic_ns() - self._stage_ns) / 1e9
         if not watch.cached:
             self.built_s[name] = took_s
-        self.say(
+        self.log(
             f"[{self._index + 1}/{len(names)}] {name}: {'from the cache' if watch.cached else 'done'}, {took_s:.1f} s"
         )
 

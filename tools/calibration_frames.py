@@ -1,7 +1,7 @@
-"""Renders the calibration sets that ship: `python -m tools.calibration_frames --out DIR` writes DIR/corridor-go2.
+"""Renders the shipped calibration sets: `python -m tools.calibration_frames --out DIR` writes DIR/corridor-go2.
 
-A simulated Go2 walks a corridor among people; what its camera sees once a second is kept with its pose and velocity.
-The same call writes the same files again (on the same machine and versions, to the byte).
+A simulated Go2 walks a corridor among people; each second its camera frame is stored with pose and velocity. The same
+call writes the same bytes on the same machine and versions.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ SLOW_AT_M, STOP_AT_M = 2.0, 0.9
 
 @dataclass(frozen=True)
 class Walk:
-    """One clip: who is there, how the robot walks, and from which second of the walk on it is recorded."""
+    """One clip: people, the robot's walk, and the second at which recording begins."""
 
     name: str
     seed: int
     people: int
     speed_mps: float
     weave_rad: float
-    """The robot's heading swings this far to both sides, so that motion offsets are not all straight."""
+    """Swing of the robot's heading to both sides, so that motion offsets are not all straight, rad."""
     period_s: float
     start_s: float
     instruction: str
@@ -52,11 +52,11 @@ WALKS = (
 
 
 class WalkError(RuntimeError):
-    """A walk that fell or ran into something: not what a robot should be calibrated on."""
+    """Walk with a fall or a collision, unusable for calibration."""
 
 
 def record(walk: Walk, duration_s: float = CLIP_S) -> Iterator[Frame]:
-    """Frames once a second of `duration_s`, stamps from 0, poses from the robot's start; raises WalkError."""
+    """Yield a frame per second for `duration_s`, stamps from 0, poses from the robot's start. Raises WalkError."""
     scene = load_scene("corridor")
     simulation = Simulation(scene, people=walk.people, seed=walk.seed)
     world = CameraWorld(scene, people=walk.people, seed=walk.seed)
@@ -84,7 +84,7 @@ def _steps(simulation: Simulation, seconds: float) -> None:
 
 
 def _command(simulation: Simulation, walk: Walk, time_s: float) -> tuple[float, float, float]:
-    """Towards the middle of the corridor with a weave; slower for people ahead, away from the side they are on."""
+    """Steer a weaving line along the corridor's middle; slow down for people ahead and turn away from them."""
     truth = simulation.truth()
     x, y, heading = float(truth.position_m[0]), float(truth.position_m[1]), float(truth.rpy_rad[2])
     speed, aside = walk.speed_mps, 0.0
@@ -110,13 +110,13 @@ def _frame(simulation: Simulation, world: CameraWorld, stamp_ns: int) -> Frame:
 
 
 def encode(frame: Frame) -> bytes:
-    """The frame's picture as the JPEG that ships."""
+    """Encode the frame's picture as JPEG."""
     bgr = cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR)
     return bytes(np.asarray(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]))
 
 
 def write_set(directory: Path) -> None:
-    """Render every walk into `directory` (its pictures and set.toml); raises WalkError, OSError."""
+    """Render every walk into `directory` (pictures and set.toml). Raises WalkError, OSError."""
     directory.mkdir(parents=True, exist_ok=True)
     lines = [
         "# Written by `python -m tools.calibration_frames`; do not edit: the hash of these files goes into manifests.",
@@ -137,7 +137,7 @@ def write_set(directory: Path) -> None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     parser = argparse.ArgumentParser(
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -1,6 +1,6 @@
 """The demo: export the graphs, start a simulated Go2 and the bridge, drive for a minute, write a report.
 
-It only starts the same commands a user would type, in this order, and reads their result files:
+It starts the commands that a user would type, in this order, and reads their result files:
 edge-export → edge-hil → edge-bridge → edge-run → report.
 """
 
@@ -42,9 +42,9 @@ INSTRUCTION = "walk down the corridor and stop at the vending machine"
 RELEASE_DELAY_S = 2
 MODEL = "nano"
 UNTRAINED_SPEED_MPS = 0.14
-"""8 m in a minute: untrained weights bend off the corridor and into its wall after 9 m. Trained ones have no limit.
+"""Distance limit for untrained weights, 8 m in a minute: they reach the corridor's wall after 9 m.
 
-A robot that pushes against its wall is stopped for good, as it should be (`odometry-stays-frozen`).
+A robot that pushes against a wall is stopped until the next arming (`odometry-stays-frozen`).
 """
 
 EXPORT_TIMEOUT_S = 1800.0
@@ -65,7 +65,7 @@ exit codes: 0 done, 1 a step or an acceptance check failed, 2 bad arguments, 130
 
 @dataclass(frozen=True)
 class DemoOptions:
-    """What to run: times in s, `domain` the DDS domain all processes meet in."""
+    """Options of the demo; times in s, `domain` is the DDS domain of all processes."""
 
     out: Path
     artifacts: Path
@@ -83,7 +83,7 @@ class DemoOptions:
             raise ValueError(f"--domain must be 0 to 232 (DDS), found {self.domain}")
 
     def as_json(self) -> Record:
-        """The options for settings.json."""
+        """Return the options for settings.json."""
         return {
             "duration_s": self.duration_s,
             "seed": self.seed,
@@ -93,18 +93,18 @@ class DemoOptions:
         }
 
     def _artifacts_from_out(self) -> str:
-        """Relative where they lie inside `out`, so that the folder may be moved, else absolute."""
+        """Return the artifacts' path, relative if inside `out`, so that the folder can be moved, else absolute."""
         out, artifacts = self.out.resolve(), self.artifacts.resolve()
         return str(artifacts.relative_to(out) if artifacts.is_relative_to(out) else artifacts)
 
     @property
     def log_dir(self) -> Path:
-        """Where every step's log goes."""
+        """Folder of the steps' logs."""
         return self.out / "log"
 
     @property
     def files(self) -> RunFiles:
-        """Where the run's files go."""
+        """Paths of the run's files."""
         return RunFiles(self.out, self.artifacts)
 
 
@@ -119,12 +119,12 @@ class TraceTail(LineTail):
         self.walked_m = 0.0
 
     def update(self) -> None:
-        """Count what was added since the last call."""
+        """Count the records since the last call."""
         for line in self.lines():
             if line["kind"] == "wire" and line["name"] == "Move":
                 self.moves += 1
             elif line["kind"] == "pose" and line["t_ns"] - self._last_ns >= 1_000_000_000:
-                # One-second steps, so that a body swaying in place does not add up to a walk.
+                # One-second steps, so that swaying in place does not count as walking.
                 position = (line["x"], line["y"])
                 self.walked_m += 0.0 if self._last is None else math.dist(position, self._last)
                 self._last, self._last_ns = position, line["t_ns"]
@@ -135,7 +135,7 @@ def run_demo(
     commands: Mapping[str, Sequence[str]] = COMMANDS,
     report: Callable[..., Record] = write_report,
 ) -> Record:
-    """Run every step into the folders that exist already and return what demo.json holds.
+    """Run every step into existing folders; returns the content of demo.json.
 
     Raises StepError or ReportError; ends all its processes.
     """
@@ -153,11 +153,11 @@ def run_demo(
 
 
 def _export(options: DemoOptions, command: Sequence[str], children: Children) -> None:
-    """Build the artifacts unless good ones are there."""
+    """Build the artifacts unless valid ones exist."""
     artifacts, ours = str(options.artifacts), options.artifacts == options.out / "artifacts"
     if options.artifacts.exists():
         if ours and not trained(options.artifacts) and shipped_weights(PRESETS[MODEL]) is not None:
-            why = "were made before there were trained weights"
+            why = "have untrained weights although trained ones are shipped"
         else:
             child = children.start("edge-export-verify", [*command, "verify", artifacts])
             if _run_to_end(children, child, f"checking the artifacts in {artifacts}") == 0:
@@ -166,7 +166,7 @@ def _export(options: DemoOptions, command: Sequence[str], children: Children) ->
             why = f"do not verify (see {child.log})"
         _print(f"artifacts in {artifacts} {why}, exporting again")
         if ours:
-            shutil.rmtree(options.artifacts)  # edge-export itself decides about any other directory
+            shutil.rmtree(options.artifacts)  # edge-export refuses any other directory
     result = str(options.files.result("edge-export"))
     arguments = ["--target", "cpu", "--model", MODEL, "--out", artifacts, "--json", result]
     child = children.start("edge-export", [*command, *arguments])
@@ -176,7 +176,7 @@ def _export(options: DemoOptions, command: Sequence[str], children: Children) ->
 
 
 def trained(artifacts: Path) -> bool:
-    """Whether their manifest says so; False for one that cannot be read."""
+    """Return whether the manifest records trained weights; False if it cannot be read."""
     try:
         return json.loads((artifacts / MANIFEST_NAME).read_text(encoding="utf-8"))["model"]["trained"] is True
     except (OSError, ValueError, KeyError, TypeError):
@@ -197,7 +197,7 @@ def _run_to_end(children: Children, child: Child, what: str) -> int:
 
 
 def _drive(options: DemoOptions, commands: Mapping[str, Sequence[str]], children: Children, socket: Path) -> None:
-    """Robot, bridge, runner; then stop them in the order that lets each write its result."""
+    """Start robot, bridge and runner; stop them in the order in which each can write its result."""
     files, domain = options.files, ["--domain", str(options.domain)]
     robot = ROBOT_FILE if trained(options.artifacts) else slow_robot(options.out, UNTRAINED_SPEED_MPS)
     common = ["--robot", str(robot), "--socket", str(socket), *domain]
@@ -221,7 +221,7 @@ def _drive(options: DemoOptions, commands: Mapping[str, Sequence[str]], children
     with _progress(describe) as progress:
         code = children.wait(run, options.duration_s + STARTUP_TIMEOUT_S, progress.tick)
     if code == EXIT_CHECK_FAILED and files.result("edge-run").exists():
-        # A fault ended the run early. Its report is the way to find out why, and fails by its checks.
+        # A fault ended the run early: write the report all the same; it shows the fault and its checks fail.
         _print(str(run.failure("a fault ended the run")))
     elif code != 0:
         raise run.failure(f"exit code {code}")
@@ -263,7 +263,7 @@ def _says_ready(log: Path) -> bool:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Command line of the demo."""
+    """Return the argument parser."""
     p = argparse.ArgumentParser(
         "python -m tools.demo",
         description=__doc__,
@@ -274,15 +274,15 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--artifacts", type=Path, metavar="DIR", help="artifact directory (default: OUT/artifacts)")
     p.add_argument("--duration", type=float, default=60.0, metavar="S", help="time to drive in s (default: 60)")
     p.add_argument("--seed", type=int, default=0, help="seed of the simulated world (default: 0)")
-    p.add_argument("--people", type=int, default=4, help="people walking about (default: 4)")
-    p.add_argument("--domain", type=int, help="DDS domain (default: one that is free)")
-    p.add_argument("--json", metavar="FILE|-", help="also write demo.json's content here; - is stdout")
+    p.add_argument("--people", type=int, default=4, help="walking people (default: 4)")
+    p.add_argument("--domain", type=int, help="DDS domain (default: a free one)")
+    p.add_argument("--json", metavar="FILE|-", help="also write demo.json's content to this file; - is stdout")
     return p
 
 
 @command_line("demo")
 def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]] = COMMANDS) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     args = parser().parse_args(argv)
     try:
         domain = free_domain() if args.domain is None else args.domain
@@ -292,7 +292,7 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]
     except (ValueError, OSError) as error:
         _print(str(error))
         return EXIT_BAD_INPUT
-    # SIGINT too: a shell starts background jobs with it ignored, and the children would inherit that.
+    # SIGINT too: a shell starts background jobs with SIGINT ignored, and children inherit that.
     before = {number: signal.signal(number, _interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         summary = run_demo(options, commands)
@@ -318,7 +318,7 @@ def _make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         reason = error.strerror or str(error)
-        raise ValueError(f"--out: cannot make the folder {folder} ({reason}); name one that can be written") from error
+        raise ValueError(f"--out: cannot make the folder {folder} ({reason}); name a writable one") from error
 
 
 def _interrupt(number: int, frame: object) -> None:

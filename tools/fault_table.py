@@ -57,7 +57,7 @@ def _ends(fault: Fault) -> str:
 
 
 def page() -> str:
-    """The whole table as Markdown, ordered by row."""
+    """Render the table as Markdown, ordered by row."""
     lines = [
         f"| {fault.row} | `{fault.name}` | {fault.where} | {_action(fault)} | "
         f"{f'{fault.bound_ms} ms' if fault.bound_ms else ''} | {_ends(fault)} | {fault.message} | {fault.advice} |"

@@ -1,1 +1,1 @@
-"""Reading other people's checkpoints (and ours) into the network, with every tensor accounted for."""
+"""Loads checkpoints of several formats into the network and accounts for every tensor."""

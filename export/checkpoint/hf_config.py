@@ -1,4 +1,4 @@
-"""The numbers of an InternVL directory's config.json, in both of its layouts; what we do not implement is refused.
+"""Reads an InternVL directory's config.json in both of its layouts; refuses values that the network does not implement.
 
 Layouts: OpenGVLab's own (`InternVLChatModel`, with `llm_config`) and that of transformers
 (`InternVLForConditionalGeneration`, with `text_config`). A key that is absent has the default of the class that wrote
@@ -22,7 +22,7 @@ PREPROCESSOR = "preprocessor_config.json"
 N = TypeVar("N", int, float)
 
 Demand = tuple[str, tuple[Any, ...], Any]
-"""Key, the values that this network implements, the default of an absent key."""
+"""Key, implemented values, default of an absent key."""
 
 _CHAT = (
     ("ps_version", ("v2",), "v1"),
@@ -70,7 +70,7 @@ _HF_VISION_DEFAULTS = {
 
 @dataclass(frozen=True)
 class HfConfig:
-    """The network of a directory."""
+    """Network configuration read from a directory."""
 
     vision: VisionConfig
     language: LanguageConfig
@@ -80,7 +80,7 @@ class HfConfig:
 
 @dataclass(frozen=True)
 class _Section:
-    """A table of config.json, whose keys are refused by their full name."""
+    """Table of config.json; errors name a key by its full path."""
 
     where: str
     content: Mapping[str, Any]
@@ -89,7 +89,7 @@ class _Section:
     def below(
         self, key: str, called: str, demands: tuple[Demand, ...], defaults: Mapping[str, int] | None = None
     ) -> _Section:
-        """A section that keeps the demands."""
+        """Return a nested section that records its demands in the same list."""
         section = self.content.get(key)
         if not isinstance(section, dict):
             raise CheckpointError(f"{self.where}has no {key}")
@@ -106,7 +106,7 @@ class _Section:
                 raise CheckpointError(f"{self.where}{key} is {value!r}, this network implements {expected}")
 
     def number(self, key: str, kind: type[N], default: object = None) -> N:
-        """A number; of a square's two sides either."""
+        """Return a number; for a [side, side] pair of a square, one of both."""
         value = self.content.get(key, self.defaults.get(key, default))
         if isinstance(value, list) and len(value) == 2 and value[0] == value[1]:
             value = value[0]
@@ -119,9 +119,9 @@ class _Section:
 
 
 def read_hf_config(directory: Path, ours: LanguageConfig) -> HfConfig:
-    """config.json in either layout; `ours` gives what it does not have (token ids, `max_context`).
+    """Read config.json in either layout; `ours` supplies values that it lacks (token ids, `max_context`).
 
-    Raises CheckpointError naming what this network does not implement.
+    Raises CheckpointError that names a value which this network does not implement.
     """
     content = read_json(directory, CONFIG)
     where = f"{directory.resolve().name}/{CONFIG}"
@@ -150,7 +150,7 @@ def check_config(directory: Path, config: TicVlaConfig) -> HfConfig:
     for section in ("vision", "language"):
         for key, b in vars(getattr(config, section)).items():
             a = getattr(getattr(theirs, section), key)
-            # The layer scale's initial value has no part in a network whose weights are loaded.
+            # Loaded weights overwrite the layer scale's initial value, so it is not compared.
             if a != b and key != "layer_scale_init":
                 pairs.append(f"{section}.{key} is {a}, model {config.name!r} has {b}")
     if pairs:
@@ -206,7 +206,7 @@ def _read(top: _Section, directory: Path, ours: LanguageConfig, vision: _Section
 
 
 def _normalisation(directory: Path) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Mean and deviation of the pixels from preprocessor_config.json where there is one, else ImageNet's."""
+    """Return the pixels' mean and deviation from preprocessor_config.json, else ImageNet's."""
     if not (directory / PREPROCESSOR).exists():
         return VisionConfig.mean, VisionConfig.std
     content = read_json(directory, PREPROCESSOR)
@@ -220,13 +220,13 @@ def _normalisation(directory: Path) -> tuple[tuple[float, float, float], tuple[f
 
 
 def _rope_theta(text: _Section, max_context: int) -> float:
-    """Base of the rotary angles; newer files keep it in `rope_parameters`, older ones beside `rope_scaling`."""
+    """Return the rotary angles' base; newer files have it in `rope_parameters`, older ones beside `rope_scaling`."""
     parameters = text.content.get("rope_parameters") or {}
     scaling = text.content.get("rope_scaling") or parameters
     kind = scaling.get("rope_type", scaling.get("type", "default"))
     if kind not in _ROPE_TYPES:
         raise CheckpointError(f"{text.where}rope_scaling of type {kind!r} is not implemented, expected {_ROPE_TYPES}")
-    # Dynamic scaling acts on sequences beyond the trained length only, which are longer than any prompt of ours.
+    # Dynamic scaling changes only sequences beyond the trained length; the runner's prompts are shorter.
     trained = text.number("max_position_embeddings", int, 32768)
     if trained < max_context:
         raise CheckpointError(f"{text.where}max_position_embeddings is {trained}, the model reads {max_context}")

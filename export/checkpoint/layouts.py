@@ -1,8 +1,8 @@
-"""Checkpoint layouts as tables: which tensor of a file becomes which tensor of ours.
+"""Checkpoint layouts as tables that map a file's tensors to the network's.
 
-A rule is (ours, theirs …). `{n}` stands for the layer; several names of theirs are stacked along the first axis (the
-encoder's q, k and v, which we keep in one matrix). Names in a table carry no prefix: `PREFIXES` lists those that
-training code puts in front.
+A rule is (network's name, file's names …). `{n}` is the layer number. Several file tensors are stacked along the first
+axis (the encoder's q, k and v, which the network has in one matrix). Names in a table have no prefix: `PREFIXES` lists
+the prefixes that training code adds.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Rule = tuple[str, ...]
 
 @dataclass(frozen=True)
 class Layout:
-    """One naming of the network's tensors."""
+    """Naming scheme of the network's tensors."""
 
     name: str
     vision: tuple[Rule, ...]
@@ -29,10 +29,10 @@ class Layout:
     language: tuple[Rule, ...]
     language_layers: tuple[Rule, ...]
     ignored: tuple[str, ...]
-    """Patterns of tensors that hold no weights: they follow from the configuration or serve training."""
+    """Patterns of tensors without weights: derived from the configuration, or used only in training."""
 
     def names(self, config: TicVlaConfig) -> dict[str, tuple[str, ...]]:
-        """Our tensor → their tensors, every layer written out."""
+        """Return the network's tensor → the file's tensors, with every layer number filled in."""
         rules = [*self.vision, *self.language]
         for each, layers in (
             (self.vision_layers, config.vision.layers),
@@ -44,7 +44,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class Match:
-    """A layout found in a file: its table with the file's own prefix."""
+    """Layout found in a file: its table with the file's prefix."""
 
     layout: str
     prefix: str
@@ -52,7 +52,7 @@ class Match:
     ignored: tuple[str, ...]
 
     def describe(self) -> str:
-        """Layout and prefix for the report."""
+        """Return layout and prefix for the report."""
         return f"{self.layout}, prefix {self.prefix}" if self.prefix else self.layout
 
 
@@ -61,7 +61,7 @@ def _both(ours: str, *theirs: str) -> tuple[Rule, ...]:
 
 
 def _decoder(root: str) -> tuple[Rule, ...]:
-    """Qwen2 layers as transformers names them, below `root`."""
+    """Return Qwen2 layers as transformers names them, below `root`."""
     layer, ours = f"{root}.layers.{{n}}", "language.layers.{n}"
     return (
         *_both(f"{ours}.q", f"{layer}.self_attn.q_proj"),
@@ -144,7 +144,7 @@ def _hugging_face(name: str, tower: str, projector: str, decoder: str, lm_head: 
 INTERNVL_HF = _hugging_face(
     "internvl-hf", "vision_tower", "multi_modal_projector", "language_model.model", "language_model.lm_head"
 )
-"""What `save_pretrained` writes."""
+"""Layout that `save_pretrained` writes."""
 
 INTERNVL_HF_MODULES = _hugging_face(
     "internvl-hf modules",
@@ -153,16 +153,16 @@ INTERNVL_HF_MODULES = _hugging_face(
     "model.language_model",
     "lm_head",
 )
-"""What `state_dict()` of the same model names its tensors, and so what a training checkpoint holds."""
+"""Layout of the same model's `state_dict()`, as in training checkpoints."""
 
 VLM_LAYOUTS = (INTERNVL, INTERNVL_HF, INTERNVL_HF_MODULES)
 
 
 def find_layouts(names: Collection[str], ours: Collection[str], config: TicVlaConfig) -> list[Match]:
-    """The VLM's layout and that of action expert and value network, where a file has them.
+    """Return the layout of the VLM and that of action expert and value network, if the file has them.
 
-    Each is the entry of layouts × prefixes that names most of the file's tensors (the earlier one of equals); what it
-    leaves unnamed counts as unknown, so that a wrong choice cannot pass.
+    Each is the combination of layout and prefix that names most of the file's tensors; ties take the earlier one.
+    Tensors that it does not name count as unknown, so the loader refuses a wrong choice.
     """
     vlm = {name: (name,) for name in ours if name.startswith(("vision.", "language."))}
     action = {name: (name,) for name in ours if name.startswith(("action.", "value."))}

@@ -1,4 +1,4 @@
-"""Checkpoints into the network: layouts found, every tensor accounted for, then read one by one as fp32."""
+"""Loads checkpoints into the network: finds layouts, accounts for every tensor, then reads them one by one as fp32."""
 
 from __future__ import annotations
 
@@ -23,31 +23,31 @@ from export.model.network import TicVla, empty_network, initialise
 from export.model.weights import FORMAT, CheckpointError, WeightsInfo
 
 SHIPPED: Final = Path(__file__).parents[1] / "weights"
-"""Trained weights that come with the package."""
+"""Trained weights in the package."""
 SHOWN = 3
 EMBED, LM_HEAD = "language.embed.weight", "language.lm_head.weight"
 VALUE_SEED = 0
-"""Of a value network that no file has: it is training's business and in no graph."""
+"""Seed of a value network that no file has; no graph uses it, only training does."""
 
 
 @dataclass(frozen=True)
 class SourceCoverage:
-    """One `--checkpoint`: how its tensors were read."""
+    """How the tensors of one `--checkpoint` were read."""
 
     label: str
     layouts: tuple[str, ...]
-    """Names of the layouts found, each with the prefix its tensors carry ("internvl, prefix vlm.")."""
+    """Layouts found, each with its tensors' prefix ("internvl, prefix vlm.")."""
     tensors: int
     loaded: int
     ignored: tuple[str, ...] = ()
-    """Tensors that hold nothing to load (buffers computed from the configuration)."""
+    """Tensors without weights (buffers computed from the configuration)."""
     outside: tuple[str, ...] = ()
-    """Entries beside the weights (optimizer state and the like) that were not read."""
+    """Other entries that were not read, such as optimizer state."""
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """Every tensor of the files and of the network accounted for."""
+    """Account of every tensor of the files and of the network."""
 
     sources: tuple[SourceCoverage, ...] = ()
     loaded: dict[str, str] = field(default_factory=dict)
@@ -61,11 +61,11 @@ class Coverage:
 
     @property
     def complete(self) -> bool:
-        """Whether nothing is missing, unknown, of another shape or given twice."""
+        """Whether no tensor is missing, unknown, duplicate or of a wrong shape."""
         return not (self.missing or self.unknown or self.misshaped or self.repeated)
 
     def difference(self) -> str:
-        """The difference in one line: a count and the first few names of each kind."""
+        """Return the differences in one line: a count and the first names of each kind."""
         kinds = {
             "missing": self.missing,
             "unknown": self.unknown,
@@ -82,7 +82,7 @@ class Coverage:
 
 @dataclass(frozen=True)
 class LoadedCheckpoint:
-    """A network and the account of where it came from."""
+    """Loaded network and the origin of its weights."""
 
     model: TicVla
     info: WeightsInfo
@@ -93,7 +93,7 @@ class LoadedCheckpoint:
 
 @dataclass
 class _Plan:
-    """What the files give, before anything is read."""
+    """Tensors found in the files, before any is read."""
 
     recipes: dict[str, tuple[Source, tuple[str, ...]]] = field(default_factory=dict)
     """Our tensor → the file and the names of the pieces there, which are stacked along the first axis."""
@@ -137,14 +137,14 @@ def load_checkpoint(paths: Sequence[Path], config: TicVlaConfig, *, fill_seed: i
 
 
 def _check_own_config(source: Source, config: TicVlaConfig) -> None:
-    """A file of ours names its network: another one is refused even where all shapes fit."""
+    """Refuse a file of this project whose recorded configuration differs, even if all shapes fit."""
     written = source.metadata.get("format", "")
     if written.split("/")[0] != FORMAT.split("/")[0]:
         return
     if written != FORMAT:
         raise CheckpointError(f"{source.label}: format {written!r}, expected {FORMAT!r}")
     try:
-        # A number that an older file does not know of: the usual value is what there was before it.
+        # An older file lacks a newer number: its default is the behaviour before the number existed.
         theirs, ours = asdict(config_from_dict(json.loads(source.metadata["config"]))), asdict(config)
         differ = [
             f"{section}.{key} is {theirs[section][key]!r}, expected {value!r}"
@@ -153,10 +153,12 @@ def _check_own_config(source: Source, config: TicVlaConfig) -> None:
             if theirs[section][key] != value
         ]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise CheckpointError(f"{source.label}: its configuration is not readable; was it changed?") from error
+        raise CheckpointError(
+            f"{source.label}: its configuration cannot be read; expected an unchanged file of edge-train or edge-export"
+        ) from error
     if differ:
         raise CheckpointError(
-            f"{source.label}: was made for another configuration than model {config.name!r} ({'; '.join(differ[:3])})"
+            f"{source.label}: has another configuration than model {config.name!r} ({'; '.join(differ[:3])})"
         )
 
 
@@ -248,7 +250,7 @@ def _read(model: TicVla, plan: _Plan) -> None:
     targets = model.state_dict()
     for ours, (source, pieces) in plan.recipes.items():
         target: Tensor = targets[ours]
-        # fp32 from bf16 and fp16 is exact; copying also frees the network from the file it came from.
+        # bf16 and fp16 convert to fp32 exactly; the copy also makes the network independent of the file.
         for part, piece in zip(target.chunk(len(pieces)) if len(pieces) > 1 else [target], pieces, strict=True):
             part.copy_(source.tensors[piece].read())
         if not torch.isfinite(target).all():
@@ -256,7 +258,7 @@ def _read(model: TicVla, plan: _Plan) -> None:
 
 
 def _info(sources: Sequence[Source], coverage: Coverage) -> WeightsInfo:
-    """Origin by file name and hash; untrained by the metadata of a file of ours or by a seed."""
+    """Return the origin by file name and hash; untrained if a file's metadata or a seed makes it so."""
     parts = []
     for source in sources:
         origin = source.metadata.get("origin", "")
@@ -268,9 +270,9 @@ def _info(sources: Sequence[Source], coverage: Coverage) -> WeightsInfo:
 
 
 def shipped_weights(config: TicVlaConfig, folder: Path = SHIPPED) -> Path | None:
-    """The file for this very network; None if there is none. Raises CheckpointError for one that cannot be read.
+    """Return the shipped weights for exactly this network, or None. Raises CheckpointError if they cannot be read.
 
-    A network of that name with changed numbers (`--set model.…`) has none: it would have to be trained.
+    A preset with changed numbers (`--set model.…`) has no shipped weights.
     """
     path = folder / f"{config.name}.safetensors"
     if not path.is_file():

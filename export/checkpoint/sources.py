@@ -1,4 +1,4 @@
-"""Where tensors come from: a safetensors file, a Hugging Face directory or a torch/Lightning file; no code is run."""
+"""Reads tensors from a safetensors file, a Hugging Face directory or a torch/Lightning file; never runs its code."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ INDEX = "model.safetensors.index.json"
 MAX_INDEX_BYTES = 16 << 20
 TORCH_SUFFIXES = (".ckpt", ".pt", ".pth", ".bin")
 NESTED = ("state_dict", "model_state_dict")
-"""Where a training checkpoint keeps its weights: Lightning's name and PyTorch's customary one."""
+"""Keys of the weights in a training checkpoint: Lightning's and the usual one of PyTorch."""
 MAX_HEADER_BYTES = 100_000_000
-"""The limit of the format's own library."""
+"""Largest header of the `safetensors` library, bytes."""
 SAFETENSORS_FLOATS = {"F32": torch.float32, "F16": torch.float16, "BF16": torch.bfloat16}
 ITEM_BYTES = {"BOOL": 1, "U8": 1, "I8": 1, "I16": 2, "U16": 2, "I32": 4, "U32": 4, "I64": 8, "U64": 8, "F64": 8}
 ITEM_BYTES |= {"F32": 4, "F16": 2, "BF16": 2, "F8_E4M3": 1, "F8_E5M2": 1}
@@ -33,7 +33,7 @@ FLOATS = tuple(SAFETENSORS_FLOATS.values())
 
 @dataclass(frozen=True)
 class SourceTensor:
-    """A tensor that is read when `read` is called."""
+    """Tensor that `read` loads."""
 
     shape: tuple[int, ...]
     read: Callable[[], Tensor]
@@ -46,11 +46,11 @@ class Source:
     label: str
     tensors: Mapping[str, SourceTensor]
     files: Mapping[str, Path]
-    """Weights files by the name that the artifacts' origin gives them (never a path of this machine)."""
+    """Weight files by the name recorded as the artifacts' origin (never a path of this machine)."""
     metadata: Mapping[str, str] = field(default_factory=dict)
     outside: tuple[str, ...] = ()
     directory: Path | None = None
-    """The Hugging Face directory, which also has config.json and tokenizer.json."""
+    """Hugging Face directory with config.json and tokenizer.json; None for a file."""
 
 
 def open_source(path: Path) -> Source:
@@ -77,7 +77,9 @@ def _from_files(label: str, paths: dict[str, Path], weight_map: dict[str, str], 
             if name in tensors:
                 raise CheckpointError(f"{file_label}: {name} is in another file of {label} too")
             if weight_map and weight_map.get(name) != path.name:
-                raise CheckpointError(f"{file_label}: {name} is not where {INDEX} says ({weight_map.get(name)})")
+                raise CheckpointError(
+                    f"{file_label}: {name} is not in the file that {INDEX} names ({weight_map.get(name)})"
+                )
             tensors[name] = SourceTensor(entry.shape, partial(file.read, name))
     absent = sorted(set(weight_map) - set(tensors))
     if absent:
@@ -101,9 +103,10 @@ def _open_directory(directory: Path) -> Source:
 
 
 def inside(directory: Path, name: str) -> Path:
-    """A file of a downloaded directory; raises CheckpointError for a name or a link that leads out of it.
+    """Return the path of a file in a downloaded directory.
 
-    The Hugging Face cache is made of links from `snapshots/REVISION/` into its own `blobs/`: those are followed.
+    Raises CheckpointError for a name or a link that leads out of it. Links of the Hugging Face cache from
+    `snapshots/REVISION/` into its `blobs/` are followed.
     """
     path = directory / name
     if Path(name).name != name or name in ("", ".", ".."):
@@ -119,7 +122,7 @@ def inside(directory: Path, name: str) -> Path:
 
 
 def read_json(directory: Path, name: str) -> dict[str, Any]:
-    """A JSON object of a downloaded directory; raises CheckpointError."""
+    """Read a JSON object of a downloaded directory. Raises CheckpointError."""
     path = inside(directory, name)
     try:
         if path.stat().st_size > MAX_INDEX_BYTES:
@@ -144,7 +147,7 @@ def _weight_map(directory: Path) -> dict[str, str]:
 def _open_torch(path: Path) -> Source:
     try:
         content = torch.load(path, map_location="cpu", mmap=True, weights_only=True)
-    except Exception as error:  # a broken or hostile file fails in the unpickler in any way it likes
+    except Exception as error:  # a damaged or hostile file may raise any exception in the unpickler
         raise CheckpointError(
             f"{path.name}: not a file of plain tensors, and code in a checkpoint is never run "
             f"({_reason(path, error)}); save its state_dict as safetensors where it was trained"
@@ -165,7 +168,7 @@ def _open_torch(path: Path) -> Source:
 
 
 def _reason(path: Path, error: Exception) -> str:
-    """What stands in the way, without torch's advice to load the file unsafely."""
+    """Return the reason, without torch's advice to load the file unsafely."""
     code = re.search(r"GLOBAL ([\w.]+)", str(error))
     if code:
         return f"it would call {code[1]}"
@@ -195,9 +198,9 @@ class Entry:
 
 
 class SafetensorsFile:
-    """The checked header of a file and its tensors on request, one in memory at a time; raises CheckpointError.
+    """Checked header of a safetensors file; tensors are read one at a time. Raises CheckpointError.
 
-    The `safetensors` package maps the whole file (this process's memory) and takes the last of two tensors of one name.
+    The `safetensors` package would map the whole file into memory and accept two tensors of one name.
     """
 
     def __init__(self, path: Path, label: str) -> None:
@@ -207,11 +210,11 @@ class SafetensorsFile:
         except OSError as error:
             raise CheckpointError(f"{label}: cannot be read ({error.strerror})") from error
         except (ValueError, RecursionError, KeyError, TypeError) as error:
-            reason = str(error) if isinstance(error, _FormatError) else "its header is not one"
+            reason = str(error) if isinstance(error, _FormatError) else "its header is not JSON"
             raise CheckpointError(f"{label}: not a readable safetensors file ({reason})") from error
 
     def read(self, name: str) -> Tensor:
-        """One tensor in the file's own type; raises CheckpointError unless it is float32, bfloat16 or float16."""
+        """Read one tensor in the file's type. Raises CheckpointError unless it is float32, bfloat16 or float16."""
         entry = self.entries[name]
         if entry.dtype not in SAFETENSORS_FLOATS:
             raise CheckpointError(f"{self.label}: {name} is {entry.dtype}, expected {', '.join(SAFETENSORS_FLOATS)}")
@@ -232,7 +235,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) != len(pairs):
         names = [name for name, _ in pairs]
-        raise _FormatError(f"{next(n for n in names if names.count(n) > 1)} is there twice")
+        raise _FormatError(f"{next(n for n in names if names.count(n) > 1)} occurs twice")
     return found
 
 
@@ -255,7 +258,7 @@ def _parse(path: Path) -> tuple[dict[str, str], dict[str, Entry]]:
             raise _FormatError(f"{name} begins at byte {entry.begin}, expected {end}")
         end = entry.end
     if end != size:
-        raise _FormatError(f"{size} bytes, its header says {end}")
+        raise _FormatError(f"{size} bytes, expected {end} from its header")
     return metadata, entries
 
 

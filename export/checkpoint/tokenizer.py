@@ -1,4 +1,4 @@
-"""Which tokenizer an artifact directory gets, checked against the network's token ids."""
+"""Selects an artifact directory's tokenizer and checks it against the network's token ids."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ ID_FIELDS = {
 
 
 def special_ids(language: LanguageConfig) -> dict[str, int]:
-    """Special token → the id that the network was built for."""
+    """Return special token → the network's id of it."""
     return {token: getattr(language, name) for name, token in ID_FIELDS.items()}
 
 
 def check_tokenizer(content: bytes, language: LanguageConfig, label: str) -> bytes:
-    """`content` if it gives the special tokens the network's ids and no id beyond it; raises CheckpointError."""
+    """Return `content` if its special tokens have the network's ids and none is too large. Raises CheckpointError."""
     try:
         tokenizer = Tokenizer.from_buffer(content)
     except Exception as error:  # the library raises plain Exception for a file it cannot read
@@ -45,7 +45,7 @@ def check_tokenizer(content: bytes, language: LanguageConfig, label: str) -> byt
 
 
 def directory_tokenizer(directory: Path, language: LanguageConfig) -> bytes | None:
-    """tokenizer.json of a Hugging Face directory, checked, or None where there is none; raises CheckpointError."""
+    """Read and check tokenizer.json of a Hugging Face directory; None without one. Raises CheckpointError."""
     if not (directory / TOKENIZER).exists():
         return None
     path = inside(directory, TOKENIZER)
@@ -55,7 +55,7 @@ def directory_tokenizer(directory: Path, language: LanguageConfig) -> bytes | No
 
 
 def tokenizer_for(config: TicVlaConfig, own: bytes | None) -> bytes:
-    """tokenizer.json for the artifacts: the checkpoint's `own` if it has one, else the one whose ids the network has.
+    """Return the artifacts' tokenizer.json: the checkpoint's `own`, else the built-in one with the network's ids.
 
     Raises CheckpointError when the ids are neither InternVL3's nor those of preset `nano`.
     """

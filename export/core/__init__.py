@@ -1,1 +1,1 @@
-"""Helpers of every export stage: strict TOML tables, settings, the cache of finished stages."""
+"""Helpers of the export stages: strict TOML tables, settings, and the cache of finished stages."""

@@ -1,8 +1,8 @@
-"""Cache of finished build stages: what a stage is made from names its result, so nothing is made twice.
+"""Cache of finished build stages; the hash of a stage's inputs is its key, so no stage is built twice.
 
 An entry is a directory `<key>/` with the stage's files and `entry.json`, their sizes and hashes. It is built in
-`<key>.partial` and renamed, so an interrupted stage leaves no entry; its hashes are checked on every use, so a damaged
-one is rebuilt, not shipped. Files leave the cache by copy only: nothing done to an output can reach what is kept here.
+`<key>.partial` and renamed, so an interrupted stage leaves no entry. Hashes are checked on every use, so a damaged
+entry is rebuilt. Outputs are copies, so a change to an output cannot change the cache.
 """
 
 from __future__ import annotations
@@ -28,29 +28,29 @@ ENTRY_NAME = "entry.json"
 RESULT_NAME = "result.json"
 PACKAGES = ("numpy", "onnx", "onnxscript", "safetensors", "tokenizers", "torch")
 VARIANTS = ("onnxruntime", "opencv-python")
-"""Packages that also come under longer names (`onnxruntime-gpu`, `opencv-python-headless`): every one counts."""
+"""Packages that also exist under longer names (`onnxruntime-gpu`, `opencv-python-headless`): all belong to the key."""
 SOURCE_FOLDERS = ("edge", "export")
 DATA_SUFFIXES = (".json", ".toml")
 _LOCK_NAME = "lock"
 _TIMINGS_NAME = "timings.json"
 _MARKER_NAME = ".tic-vla-edge-cache"
 _OURS = re.compile(r"[0-9a-f]{64}(\.partial|\.building)?", re.ASCII)
-"""Names of entries and of what is around one while it is built; nothing of another name is ever removed."""
+"""Names of entries and of their temporary files; the cache removes no other name."""
 _CHUNK_BYTES = 1 << 22
 
 
 class CacheError(OSError):
-    """A cache directory that cannot be used; its text is the one line to show."""
+    """Unusable cache directory; its text is the one line to show."""
 
 
 def default_cache_dir(environ: Mapping[str, str]) -> Path:
-    """`$XDG_CACHE_HOME/tic-vla-edge`, or `~/.cache/tic-vla-edge` where that is not set to an absolute path."""
+    """Return `$XDG_CACHE_HOME/tic-vla-edge`, or `~/.cache/tic-vla-edge` unless that variable is an absolute path."""
     named = Path(environ.get("XDG_CACHE_HOME", ""))
     return (named if named.is_absolute() else Path.home() / ".cache") / "tic-vla-edge"
 
 
 def file_sha256(path: Path) -> str:
-    """SHA-256 of a file, read in pieces; raises OSError."""
+    """Compute the SHA-256 of a file in blocks. Raises OSError."""
     digest = hashlib.sha256()
     with path.open("rb") as stream:
         while piece := stream.read(_CHUNK_BYTES):
@@ -60,9 +60,9 @@ def file_sha256(path: Path) -> str:
 
 @lru_cache
 def source_sha256(modules: tuple[str, ...]) -> str:
-    """Hash of our modules, of all of ours that they import, and of the data files beside these.
+    """Hash modules of this project, all that they import from it, and the data files beside these.
 
-    Another version of that code finds none of the old entries; an edit anywhere else leaves them valid.
+    A change of that code invalidates its entries; a change elsewhere keeps them valid.
     """
     root, digest = Path(__file__).parents[2], hashlib.sha256()
     waiting, found = list(modules), dict[str, Path]()
@@ -82,7 +82,7 @@ def source_sha256(modules: tuple[str, ...]) -> str:
 
 
 def _imports(path: Path) -> set[str]:
-    """Names that a file imports, at its top or inside functions; `from a import b` may mean the module a.b."""
+    """Return the names that a file imports, also inside functions; `from a import b` may mean the module a.b."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -94,7 +94,7 @@ def _imports(path: Path) -> set[str]:
 
 @lru_cache
 def package_versions() -> dict[str, str]:
-    """Installed versions of the packages that a result depends on."""
+    """Return the installed versions of the packages that a result depends on."""
     found = {name: importlib.metadata.version(name) for name in PACKAGES}
     for distribution in importlib.metadata.distributions():
         name = str(distribution.metadata["Name"] or "").lower().replace("_", "-")
@@ -104,7 +104,7 @@ def package_versions() -> dict[str, str]:
 
 
 def stage_key(stage: str, parts: Mapping[str, object], modules: Sequence[str]) -> str:
-    """SHA-256 of everything that a stage's result follows from: `parts` (plain JSON) and the code of `modules`."""
+    """Hash all inputs of a stage: `parts` (plain JSON) and the code of `modules`. Returns a SHA-256."""
     source = source_sha256(tuple(sorted(modules)))
     content = {"stage": stage, "parts": parts, "packages": package_versions(), "source": source}
     return hashlib.sha256(json.dumps(content, sort_keys=True, allow_nan=False).encode()).hexdigest()
@@ -120,7 +120,7 @@ def fsync_path(path: Path) -> None:
 
 
 @contextmanager
-def open_cache(directory: Path, limit_bytes: int, say: Callable[[str], None]) -> Iterator[StageCache]:
+def open_cache(directory: Path, limit_bytes: int, log: Callable[[str], None]) -> Iterator[StageCache]:
     """Open the cache. On exit, remove the least recently used entries until the rest fits `limit_bytes`.
 
     Entries are removed only if no other process has the cache open. Raises CacheError, also for a foreign folder.
@@ -137,7 +137,7 @@ def open_cache(directory: Path, limit_bytes: int, say: Callable[[str], None]) ->
         ) from error
     try:
         fcntl.flock(descriptor, fcntl.LOCK_SH)
-        cache = StageCache(directory, say)
+        cache = StageCache(directory, log)
         try:
             yield cache
         finally:
@@ -149,7 +149,7 @@ def open_cache(directory: Path, limit_bytes: int, say: Callable[[str], None]) ->
 
 
 def _claim(directory: Path) -> None:
-    """Mark a directory as a cache of ours; raises CacheError for one that holds anything else."""
+    """Mark a directory as a cache. Raises CacheError if it holds other files."""
     marker = directory / _MARKER_NAME
     if marker.exists():
         return
@@ -157,23 +157,23 @@ def _claim(directory: Path) -> None:
     others = sorted(p.name for p in directory.iterdir() if p.name not in known and not _OURS.fullmatch(p.name))
     if others:
         raise CacheError(
-            f"cache {directory}: holds {others[0]}, which no cache of ours does; name an empty or a new directory"
+            f"cache {directory}: holds {others[0]}, which is not part of a cache; name an empty or new directory"
         )
     marker.touch()
 
 
 @dataclass(frozen=True)
 class StageCache:
-    """Finished stages in a directory, each under the hash of what it was made from; made by `open_cache`."""
+    """Finished stages in a directory, each under the hash of its inputs; created by `open_cache`."""
 
     directory: Path
-    say: Callable[[str], None]
+    log: Callable[[str], None]
 
     def fetch_or_build(self, key: str, build: Callable[[Path], None]) -> tuple[Path, bool]:
-        """Directory of a stage's files and whether they were there already; else `build` writes them.
+        """Return the directory of a stage's files, which `build` writes unless cached, and whether they were cached.
 
-        A second process that wants the same stage waits for the first and takes its result. Whatever `build` raises
-        comes through and leaves no entry.
+        A second process that needs the same stage waits for the first and uses its result. Exceptions of `build`
+        propagate and leave no entry.
         """
         entry = self.directory / key
         with self._locked(key):
@@ -182,7 +182,7 @@ class StageCache:
                 if damage is None:
                     os.utime(entry / ENTRY_NAME)  # its age counts from its last use
                     return entry, True
-                self.say(f"cache: {damage}; building it again")
+                self.log(f"cache: {damage}; building it again")
                 shutil.rmtree(entry)
             partial = self.directory / f"{key}.partial"
             shutil.rmtree(partial, ignore_errors=True)  # left by a process that was killed
@@ -197,7 +197,7 @@ class StageCache:
         return entry, False
 
     def result(self, key: str, compute: Callable[[], Mapping[str, object]]) -> tuple[dict[str, Any], bool]:
-        """A stage whose result is plain JSON, and whether it was there already."""
+        """Return a stage's result as plain JSON, and whether it was cached."""
 
         def build(directory: Path) -> None:
             text = json.dumps(compute(), indent=1, sort_keys=True, allow_nan=False) + "\n"
@@ -208,7 +208,7 @@ class StageCache:
         return content, cached
 
     def timings(self, run: str) -> dict[str, float]:
-        """Seconds that each stage took the last time it was built for this kind of run; empty when unknown."""
+        """Return each stage's last build time for this kind of run, s; empty if unknown."""
         known = self._all_timings().get(run)
         pairs = known.items() if isinstance(known, dict) else ()
         return {k: float(v) for k, v in pairs if isinstance(v, int | float) and not isinstance(v, bool) and v >= 0}
@@ -223,11 +223,11 @@ class StageCache:
         try:
             content = json.loads((self.directory / _TIMINGS_NAME).read_text(encoding="utf-8"))
         except (OSError, ValueError):
-            return {}  # never there before, or damaged: an estimate is not worth an error
+            return {}  # absent or damaged: a missing estimate is no error
         return content if isinstance(content, dict) else {}
 
     def prune(self, limit_bytes: int) -> None:
-        """Drop leftovers of killed processes and the entries used longest ago, until the rest fits."""
+        """Delete leftovers of killed processes and the least recently used entries, until the rest fits."""
         ours = [path for path in self.directory.iterdir() if _OURS.fullmatch(path.name) and not path.is_symlink()]
         for leftover in [path for path in ours if path.suffix]:
             shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
@@ -251,7 +251,7 @@ class StageCache:
 
 
 def _seal(directory: Path) -> None:
-    """Record what is in a finished stage, and force all of it to the disk before it gets its name."""
+    """Record the files of a finished stage and force them to the disk, before the rename makes it an entry."""
     files = sorted(path for path in directory.iterdir())
     content = {path.name: {"sha256": file_sha256(path), "bytes": path.stat().st_size} for path in files}
     entry = directory / ENTRY_NAME
@@ -261,7 +261,7 @@ def _seal(directory: Path) -> None:
 
 
 def _damage(entry: Path) -> str | None:
-    """What is wrong with an entry; None when every file is what was recorded and no file is beside them."""
+    """Return what is damaged in an entry; None if its files are exactly those recorded."""
     try:
         files = json.loads((entry / ENTRY_NAME).read_text(encoding="utf-8"))["files"]
         found = sorted(path.name for path in entry.iterdir() if path.name != ENTRY_NAME)
@@ -269,7 +269,7 @@ def _damage(entry: Path) -> str | None:
             return f"{entry.name[:12]}… holds {found}, recorded were {sorted(files)}"
         for name, recorded in files.items():
             if file_sha256(entry / name) != recorded["sha256"]:
-                return f"{entry.name[:12]}…/{name} is not what was stored"
+                return f"{entry.name[:12]}…/{name} differs from the stored file"
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         return f"{entry.name[:12]}… cannot be read ({error})"
     return None

@@ -1,4 +1,4 @@
-"""Frozen dataclasses from TOML tables: every key known, every value of its field's type, one line when not."""
+"""Builds frozen dataclasses from TOML tables; an unknown key or a wrong type gives a one-line error."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ T = TypeVar("T")
 
 
 class FieldError(ValueError):
-    """A key that is not known, a key that is missing or a value of another type; its text is the one line to show."""
+    """Unknown key, missing key or value of a wrong type; its text is the one line to show."""
 
 
 class SettingText(str):
-    """A value as the command line gives it; `convert` reads it as its field's type."""
+    """Value from the command line as text; `convert` reads it as its field's type."""
 
 
 def near(name: str, known: typing.Iterable[str]) -> str:
-    """`expected one of …`, the names most like `name` first."""
+    """Return `did you mean …` with similar names, else `expected one of …`."""
     names = sorted(known)
     close = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
     if close:
@@ -39,13 +39,13 @@ def near(name: str, known: typing.Iterable[str]) -> str:
 
 
 def field_types(cls: type) -> dict[str, Any]:
-    """Type of every field of a dataclass."""
+    """Return the type of every field of a dataclass."""
     hints = typing.get_type_hints(cls)
     return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
 
 
 def build(cls: type[T], content: object, where: str) -> T:
-    """An instance of the dataclass `cls` from a table; raises FieldError naming `where`."""
+    """Build the dataclass `cls` from a table. Raises FieldError that names `where`."""
     if not isinstance(content, Mapping):
         raise FieldError(f"{where}: expected a table, found {content!r}")
     known = field_types(cls)
@@ -66,7 +66,7 @@ def build(cls: type[T], content: object, where: str) -> T:
 
 
 def convert(kind: object, value: object, where: str) -> Any:
-    """`value` as the type `kind`; raises FieldError. A dataclass may read a setting by a `from_setting` of its own."""
+    """Convert `value` to the type `kind`. Raises FieldError. A dataclass may define `from_setting` for settings."""
     if isinstance(value, SettingText):
         own = [option for option in (kind, *typing.get_args(kind)) if hasattr(option, "from_setting")]
         value = own[0].from_setting(str(value), where) if own else from_text(kind, str(value), where)
@@ -104,7 +104,7 @@ def convert(kind: object, value: object, where: str) -> Any:
 
 
 def from_text(kind: object, text: str, where: str) -> Any:
-    """A command line's text as the type `kind`; raises FieldError."""
+    """Convert text of the command line to the type `kind`. Raises FieldError."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
         if type(None) in arguments and text == "none":
@@ -136,7 +136,7 @@ def from_text(kind: object, text: str, where: str) -> Any:
 
 
 def _kind_name(kind: object) -> str:
-    """A type as an error names it."""
+    """Return a type's name for error messages."""
     names = {str: "a text", int: "a whole number", float: "a finite number", bool: "true or false"}
     if kind in names:
         return names[kind]
@@ -144,7 +144,7 @@ def _kind_name(kind: object) -> str:
 
 
 def plain(value: object) -> Any:
-    """A dataclass as tables, lists and scalars that `build` reads back; absent options are left out."""
+    """Convert a dataclass to tables, lists and scalars that `build` reads back; omits options that are None."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         pairs = ((field.name, getattr(value, field.name)) for field in dataclasses.fields(value))
         return {name: plain(item) for name, item in pairs if item is not None}

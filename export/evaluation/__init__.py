@@ -1,1 +1,1 @@
-"""How exact a rounded model is: references, metrics, the task error, the gate, and the choice of precision."""
+"""Accuracy of a rounded model: references, metrics, task error, gates, and the choice of precision."""

@@ -1,7 +1,7 @@
-"""Calibration data: named, hashed walks of a robot through people; never random.
+"""Calibration data: named, hashed recordings of a robot that walks among people; never random.
 
-A name is a set that ships in `calibration_sets/` here, `folder:PATH` (a user's images in the order of their names) or
-`video:PATH`. What a user's pictures do not record (poses, velocities) is assumed, and `Clip.assumed` names it.
+A name is a shipped set of `calibration_sets/`, `folder:PATH` (the user's images, ordered by name) or `video:PATH`.
+A user's pictures lack poses and velocities: these are assumed, and `Clip.assumed` names the assumptions.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ Picture = npt.NDArray[np.uint8]
 
 SETS = Path(__file__).with_name("calibration_sets")
 CLIP_S = 20.0
-"""Shortest clip: 9 s of the frames before an anchor, 10 s of growing delay after it, and 1 s to choose anchors in."""
+"""Shortest clip, s: 9 s of frames before an anchor, 10 s of growing delay after it, 1 s to choose the anchor in."""
 MAX_GAP_S = 1.5
 MAX_CLIPS = 3
-"""Clips taken from a user's folder or video: more would cost minutes at paper size and change no decision."""
+"""Largest number of clips from a user's folder or video: more take minutes at paper size and change no decision."""
 MAX_SIDE_PX = 960
 ASSUMED_SPEED_MPS = 0.5
 ASSUMED_INSTRUCTION = "walk straight ahead"
@@ -35,12 +35,12 @@ IMAGE_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".webp")
 
 
 class CalibrationError(ValueError):
-    """A calibration set that is not known, cannot be read or is too short."""
+    """Calibration set that is unknown, unreadable or too short."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One picture, uint8 RGB [h, w, 3], where the robot was and how fast it moved (vx m/s, vy m/s, ωz rad/s)."""
+    """Picture, uint8 RGB [h, w, 3], with the robot's pose and velocity (vx m/s, vy m/s, ωz rad/s)."""
 
     stamp_ns: int
     image: Picture
@@ -50,13 +50,13 @@ class Frame:
 
 @dataclass(frozen=True)
 class Clip:
-    """At least 20 s of frames about 1 s apart, oldest first, and the instruction that was followed."""
+    """At least 20 s of frames about 1 s apart, oldest first, with the instruction of the walk."""
 
     name: str
     instruction: str
     frames: tuple[Frame, ...]
     assumed: str = ""
-    """What was not recorded but assumed, in words; empty when everything was recorded."""
+    """Assumptions in place of recorded values, as text; empty if all values were recorded."""
 
     def __post_init__(self) -> None:
         stamps = [frame.stamp_ns / 1e9 for frame in self.frames]
@@ -76,15 +76,15 @@ class Clip:
 
 @dataclass(frozen=True)
 class CalibrationSet:
-    """Clips with the SHA-256 of every file they came from."""
+    """Clips with the SHA-256 of all their files."""
 
     name: str
-    """Of a set that ships, or kind and base name of a user's own (`folder:corridor`): no path of a machine."""
+    """Name of a shipped set, or kind and base name of the user's (`folder:corridor`); never a path."""
     sha256: str
     clips: tuple[Clip, ...]
 
     def to_dict(self) -> dict[str, object]:
-        """What the manifest keeps: name, hash, counts and what was assumed."""
+        """Return the manifest's entry: name, hash, counts and assumptions."""
         assumed = sorted({clip.assumed for clip in self.clips if clip.assumed})
         return {
             "name": self.name,
@@ -121,12 +121,12 @@ class _SetFile:
 
 
 def list_calibration_sets() -> list[str]:
-    """Names of the sets that ship."""
+    """Return the names of the shipped sets."""
     return sorted(path.parent.name for path in SETS.glob("*/set.toml"))
 
 
 def load_calibration(name: str) -> CalibrationSet:
-    """The set of that name, `folder:PATH` or `video:PATH`; raises CalibrationError with one clear line."""
+    """Load a set by name, `folder:PATH` or `video:PATH`. Raises CalibrationError with a one-line message."""
     kind, colon, path = name.partition(":")
     if colon and kind in USER_KINDS and path:
         return USER_KINDS[kind](f"{kind}:{Path(path).resolve().name}", Path(path))
@@ -139,7 +139,7 @@ def load_calibration(name: str) -> CalibrationSet:
 
 
 def read_set(directory: Path) -> CalibrationSet:
-    """A set from its directory (set.toml and the pictures it lists, nothing else); raises CalibrationError."""
+    """Read a set from its directory, which holds set.toml and its pictures only. Raises CalibrationError."""
     where = f"calibration set {directory.name}"
     try:
         contents = {path.name: path.read_bytes() for path in sorted(directory.iterdir())}
@@ -182,7 +182,7 @@ def _decode(data: bytes, where: str) -> Picture:
 
 
 def _rgb(bgr: npt.NDArray[Any]) -> Picture:
-    """RGB, at most MAX_SIDE_PX a side: a minute of full camera pictures would take gigabytes."""
+    """Convert to RGB of at most MAX_SIDE_PX a side: full camera pictures of a minute would take gigabytes."""
     scale = MAX_SIDE_PX / max(bgr.shape[:2])
     if scale < 1:
         size = (max(1, round(bgr.shape[1] * scale)), max(1, round(bgr.shape[0] * scale)))
@@ -191,7 +191,7 @@ def _rgb(bgr: npt.NDArray[Any]) -> Picture:
 
 
 def _windows(count: int, where: str) -> list[range]:
-    """Up to MAX_CLIPS stretches of 20 s, spread over `count` pictures that are 1 s apart."""
+    """Return up to MAX_CLIPS ranges of 20 s, spread over `count` pictures 1 s apart."""
     length = round(CLIP_S) + 1
     if count < length:
         raise CalibrationError(f"{where}: {count} pictures 1 s apart, at least {length} are needed")
@@ -245,7 +245,7 @@ def _load_video(name: str, path: Path) -> CalibrationSet:
 
 
 def _video_frames(path: Path, where: str) -> list[Picture]:
-    """One picture for every second of the video's first ten minutes."""
+    """Read one picture per second of the video's first ten minutes."""
     capture = cv2.VideoCapture(str(path))
     try:
         fps = capture.get(cv2.CAP_PROP_FPS) if capture.isOpened() else 0.0
@@ -254,7 +254,7 @@ def _video_frames(path: Path, where: str) -> list[Picture]:
         images: list[Picture] = []
         index = 0
         while len(images) < 600 and capture.grab():
-            # Every picture is grabbed in turn: seeking lands on other frames with other codecs.
+            # Grab every picture in sequence: the frame that seeking reaches depends on the codec.
             if index >= len(images) * fps:
                 ok, bgr = capture.retrieve()
                 if not ok:

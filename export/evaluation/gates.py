@@ -1,6 +1,6 @@
-"""The gate: a graph that is not the same model, by the target's own thresholds, is not exported.
+"""Gates: compare each graph with PyTorch in fp32 and refuse the export if a threshold of the target is exceeded.
 
-Graphs run from the verified bytes of a directory, on the provider that ships if it is here, against PyTorch in fp32.
+Graphs run from the verified bytes of a directory, on the target's provider if this machine has it, else on the CPU.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ PASS, WARN, FAIL = "PASS", "WARN", "FAIL"
 
 
 class GateError(Exception):
-    """A graph that is not the same model; its text names it and the numbers."""
+    """Graph that failed its gate; the text has its name and the numbers."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """PASS, WARN or FAIL with a line for every threshold that was crossed."""
+    """PASS, WARN or FAIL, with one line per crossed threshold."""
 
     level: str
     reasons: tuple[str, ...] = ()
@@ -56,7 +56,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class GateResult:
-    """What the gate found for one graph, where it ran it, and what it made of that."""
+    """Measurements and verdict of one graph, and the provider that ran it."""
 
     parity: ParityResult
     task: TaskResult | None
@@ -65,7 +65,7 @@ class GateResult:
     shipping_provider: str
 
     def to_dict(self) -> dict[str, Any]:
-        """The manifest's `parity` section."""
+        """Return the manifest's `parity` section."""
         return {
             **asdict(self.parity),
             "task": None if self.task is None else asdict(self.task),
@@ -79,9 +79,9 @@ class GateResult:
 def judge(
     parity: ParityResult, task: TaskResult | None, gate: GraphGate, task_gate: TaskGate, *, trained: bool = True
 ) -> Verdict:
-    """Hold one graph's numbers against its thresholds; a comparison that is not a number fails.
+    """Compare one graph's numbers with its thresholds; NaN fails.
 
-    The logits of untrained weights are nearly ties, which any rounding decides otherwise: there another token warns,
+    Logits of untrained weights are nearly equal, so rounding changes the chosen token: a different token only warns,
     and text is not compared.
     """
     failed: list[str] = []
@@ -119,8 +119,8 @@ def judge(
         if task.semantic is None or not task.semantic >= task_gate.min_semantic:
             moved = 0.0 if task.semantic is None else task.semantic
             warned.append(
-                f"the exact model's plans hardly follow the semantic state: another one moves them by {moved:.2g} of "
-                f"their spread (≥ {task_gate.min_semantic:g}), so the task says little about the language model"
+                f"the exact model's plans hardly depend on the semantic state: another moves them by {moved:.2g} of "
+                f"their spread (≥ {task_gate.min_semantic:g}), so the task error is a weak test of the language model"
             )
     if failed:
         return Verdict(FAIL, tuple(failed))
@@ -134,18 +134,21 @@ def require(graph: str, verdict: Verdict) -> None:
 
 
 NEW_TOKENS = 16
-"""Greedy tokens of every calibration prompt that are compared."""
+"""Number of greedy tokens compared per calibration prompt."""
 
 
 def threads_for(config: TicVlaConfig) -> int:
-    """Threads for everything that is measured on a model: always the same number, because another one may sum in
-    another order and report another last digit. A small model's kernels are too short for two."""
+    """Return the number of threads for all measurements of a model.
+
+    It is fixed, because the number of threads changes the order of sums and so the last digit. A small model's
+    kernels are too short for two threads.
+    """
     return 2 if is_large(config) else 1
 
 
 @lru_cache
 def provider_loads(provider: str) -> bool:
-    """Whether ONNX Runtime can open a graph on that provider here: one may be listed whose libraries are missing."""
+    """Return whether ONNX Runtime can open a graph on a provider; it may list one whose libraries are missing."""
     if provider not in ort.get_available_providers():
         return False
     value = onnx.helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, [1])
@@ -157,30 +160,30 @@ def provider_loads(provider: str) -> bool:
     options.log_severity_level = 4
     try:
         session = ort.InferenceSession(model.SerializeToString(), sess_options=options, providers=[provider])
-    except Exception:  # noqa: BLE001 - a provider fails in any way it likes; all that matters is that it does
+    except Exception:  # noqa: BLE001 - a provider may raise anything; any failure means that it is unusable
         return False
     return bool(session.get_providers()[0] == provider)
 
 
 def gate_provider(shipping: str) -> str:
-    """The provider that the gate runs a graph on: the shipping one if it loads here, else the CPU's."""
+    """Return the provider on which the gate runs a graph: the target's if it loads on this machine, else the CPU's."""
     return shipping if provider_loads(shipping) else CPU_PROVIDER
 
 
 class OpenGraph:
-    """A graph of the directory as the gate runs it: arrays by name, in and out in fp32 whatever it computes in."""
+    """Graph of a directory, opened for the gate: inputs and outputs are fp32 arrays by name, whatever its precision."""
 
     def __init__(self, artifacts: Artifacts, name: str, threads: int) -> None:
         shipping = artifacts.graphs[name].session.provider
         self.provider = gate_provider(shipping)
-        # With its own options on its own provider; the CPU's has none of the shipping one's.
+        # The provider's options are valid only on that provider, not on the CPU's.
         self._graph = Graph(
             artifacts, name, threads=threads, provider=None if self.provider == shipping else self.provider
         )
         self._dtypes = {tensor.name: DTYPES[tensor.dtype] for tensor in artifacts.graphs[name].inputs}
 
     def __call__(self, feeds: Arrays) -> Arrays:
-        """Run once; raises edge.inference.graph.GraphError."""
+        """Run the graph once. Raises edge.inference.graph.GraphError."""
         typed = {name: np.asarray(feeds[name]).astype(dtype, copy=False) for name, dtype in self._dtypes.items()}
         found = self._graph.run(typed)
         return {
@@ -190,7 +193,7 @@ class OpenGraph:
 
 
 class TaskCheck:
-    """What the robot does differently when one graph is the shipped one and the others are PyTorch's in fp32."""
+    """Task error of one exported graph, with all others computed by PyTorch in fp32."""
 
     def __init__(self, torch_stages: TorchStages, reference: StageOutputs, samples: SampleSet) -> None:
         self._torch = torch_stages
@@ -198,13 +201,13 @@ class TaskCheck:
         self._samples = samples
 
     def vision(self, graph: OpenGraph) -> TaskResult:
-        """Of the shipped encoder."""
+        """Return the task error of the exported encoder."""
         visual = [graph({"frame": frame})["visual_tokens"] for frame in self._samples.frames]
         kv = [self._torch.language(prompt_parts(s, visual), 0)[0] for s in self._samples.samples]
         return self._compare(visual, kv, self._torch.context)
 
     def language(self, artifacts: Artifacts, threads: int, provider: str | None) -> TaskResult:
-        """Of the shipped language model: one graph, or the pair as it runs together."""
+        """Return the task error of the exported language model: one graph, or prefill and decode together."""
         model = LanguageModel(artifacts, threads=threads, provider=provider)
         kv, texts = [], []
         for sample in self._samples.samples:
@@ -215,14 +218,14 @@ class TaskCheck:
         return self._compare(self._reference.visual, kv, self._torch.context, texts=texts)
 
     def context(self, graph: OpenGraph) -> TaskResult:
-        """Of the shipped semantic context."""
+        """Return the task error of the exported semantic context."""
         name = guidance_input(self._torch.model.config)[0]
         return self._compare(
             self._reference.visual, self._reference.kv, lambda guidance: _unpacked(graph({name: guidance}))
         )
 
     def action(self, graph: OpenGraph) -> TaskResult:
-        """Of the shipped action expert."""
+        """Return the task error of the exported action expert."""
         return self._compare(self._reference.visual, self._reference.kv, self._torch.context, act=_shipped_act(graph))
 
     def _compare(
@@ -238,21 +241,21 @@ class TaskCheck:
             plan(act or self._torch.act, s, visual, moment_contexts(context, s, x))
             for s, x in zip(self._samples.samples, kv, strict=True)
         )
-        # Graphs that write no text are not held to any.
+        # Text is compared only for graphs that decode it.
         reference = self._reference if texts is not None else replace(self._reference, token_ids=tuple(() for _ in kv))
         found = StageOutputs(tuple(visual), tuple(kv), tuple(texts or reference.token_ids), trajectories, ())
         return compare(reference, found, self._samples)
 
 
 def _unpacked(context: Arrays) -> tuple[Floats, Floats]:
-    """Keys and values [layers, 1, heads, T, d] of the graphs' layout (a tensor a layer, keys transposed)."""
+    """Convert the graphs' layout (a tensor per layer, keys transposed) to keys and values [layers, 1, heads, T, d]."""
     layers = range(len(context) // 2)
     keys = np.stack([context[f"context.{i}.key"].swapaxes(2, 3) for i in layers])
     return np.ascontiguousarray(keys), np.stack([context[f"context.{i}.value"] for i in layers])
 
 
 def _shipped_act(graph: OpenGraph) -> Act:
-    """`TorchStages.act` through the shipped graph, whose context has the layout that it reads fastest."""
+    """Return a `TorchStages.act` that runs the exported graph, with the context in the graph's layout."""
 
     def act(visual_tokens: Floats, state: Floats, latency: Floats, keys: Floats, values: Floats) -> Floats:
         feeds: Arrays = {

@@ -1,4 +1,4 @@
-"""A graph against PyTorch: seeded test inputs, what PyTorch makes of them, and how far the graph's outputs are from it.
+"""Compares a graph with PyTorch: seeded test inputs, PyTorch's outputs, and the distance of the graph's outputs.
 
 Worst cosine, largest difference and agreement of the chosen token; references are kept as safetensors files.
 """
@@ -27,20 +27,20 @@ Arrays = dict[str, Array]
 RunGraph = Callable[[Arrays], Arrays]
 
 PRIMARY_OUTPUTS = ("visual_tokens", "logits", "last_layer_kv", "context.0.value", "trajectory")
-"""What must differ between two inputs; caches echo their input and would always differ."""
+"""Outputs that must differ between two inputs; caches contain their input and would always differ."""
 
 
 class ParityError(Exception):
-    """Outputs that cannot be compared: another shape, or values that are not finite."""
+    """Outputs that cannot be compared: different shapes, or values that are not finite."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One test input of a graph and what PyTorch makes of it, both by tensor name."""
+    """Test input of a graph and PyTorch's outputs, by tensor name."""
 
     feeds: dict[str, Array]
     expected: dict[str, Array]
-    """Outputs to compare; a graph may have more, which are then not judged."""
+    """Outputs to compare; other outputs of the graph are ignored."""
 
 
 @dataclass(frozen=True)
@@ -51,13 +51,13 @@ class ParityResult:
     cosine: float
     max_abs: float
     min_difference: float
-    """Smallest largest difference between the outputs of two different inputs (negative control)."""
+    """Minimum over pairs of different inputs of the largest difference of their outputs (negative control)."""
     top1: float | None
     """Share of positions at which the same token is most likely, 0 to 1; None for a graph without tokens."""
 
 
 def compare(graph: str, samples: Sequence[Sample], run: RunGraph) -> ParityResult:
-    """Run a graph over all samples and compare; raises ParityError, and ValueError for less than two samples."""
+    """Run a graph on all samples and compare. Raises ParityError, and ValueError for fewer than two samples."""
     if len(samples) < 2:
         raise ValueError(f"{graph}: {len(samples)} samples, expected two or more for the negative control")
     cosine, max_abs, min_difference = 1.0, 0.0, np.inf
@@ -70,7 +70,7 @@ def compare(graph: str, samples: Sequence[Sample], run: RunGraph) -> ParityResul
             if not expected.size:
                 continue
             if name == "next_token":
-                # An index has no cosine. Where there are logits, they are compared instead.
+                # An index has no cosine: logits are compared instead, if the graph has them.
                 if "logits" not in sample.expected:
                     same, tokens = same + int(np.sum(expected == actual)), tokens + expected.size
                 continue
@@ -103,7 +103,7 @@ def _comparable(graph: str, name: str, expected: Array, found: Arrays) -> Array:
 
 
 def _difference(a: Sequence[Array], b: Sequence[Array]) -> float:
-    """Largest difference where two runs overlap (their free axes may differ in length)."""
+    """Return the largest difference over the part that both runs have (free axes may differ in length)."""
     largest = 0.0
     for x, y in zip(a, b, strict=True):
         cut = tuple(slice(0, min(m, n)) for m, n in zip(x.shape, y.shape, strict=True))
@@ -113,7 +113,7 @@ def _difference(a: Sequence[Array], b: Sequence[Array]) -> float:
 
 
 def sample_inputs(config: TicVlaConfig, name: str, index: int) -> Arrays:
-    """The `index`-th test input of a graph: seeded, all different, with the lengths a run meets."""
+    """Build the test input number `index` of a graph: seeded, all different, with lengths as in a run."""
     rng = np.random.default_rng([index, 7])
     vision = config.vision
 
@@ -121,7 +121,7 @@ def sample_inputs(config: TicVlaConfig, name: str, index: int) -> Arrays:
         return rng.standard_normal(shape).astype(np.float32)
 
     if name == "vision_encoder":
-        # A smooth picture and noise in turn: a frame is neither flat nor white.
+        # Alternate a smooth picture and noise: a real frame is in between.
         coarse = rng.integers(0, 256, (1, 4, 4, 3)) if index % 2 else rng.integers(0, 256, (1, 64, 64, 3))
         repeat = -(-vision.image_px // coarse.shape[1])
         frame = coarse.repeat(repeat, axis=1).repeat(repeat, axis=2)[:, : vision.image_px, : vision.image_px]
@@ -146,14 +146,14 @@ def sample_inputs(config: TicVlaConfig, name: str, index: int) -> Arrays:
 
 
 def _language_inputs(config: TicVlaConfig, name: str, index: int, rng: np.random.Generator) -> Arrays:
-    """Text and frames on empty and on filled buffers; a call that begins inside a frame; a single token."""
+    """Build text and frames on empty and filled buffers, a call that begins inside a frame, and a single token."""
     language, role = config.language, ROLES[name]
     frames = index % 3 if role.images else 0
     past = 0 if index % 2 == 0 else int(rng.integers(1, 60))
     ids = rng.integers(0, language.vocab - 1, (1, 3 + index))
     ids += ids >= language.img_context_id
     image = np.full((1, frames * config.frame_tokens), language.img_context_id)
-    # The call before this one ended inside the frame: the places here begin with that frame's later tokens.
+    # The previous call ended inside the frame: this call begins with that frame's remaining tokens.
     skipped = config.frame_tokens // 4 if frames and past else 0
     ids = np.concatenate([ids[:, :2], image[:, skipped:], ids[:, 2:]], axis=1) if index != 3 else ids[:, :1]
     total = past + ids.shape[1]
@@ -162,7 +162,7 @@ def _language_inputs(config: TicVlaConfig, name: str, index: int, rng: np.random
         "input_ids": ids,
         "seqlens_k": np.array([total - 1], dtype=np.int32),
         "total_sequence_length": np.array(total, dtype=np.int32),
-        # Rows after the past hold what an earlier generation left there; they must not be read.
+        # Rows after the past hold an earlier generation's values; the graph must not read them.
         **{n: rng.standard_normal(shape).astype(np.float32) for n in cache_names(language.layers, "past_key_values")},
     }
     if role.images:
@@ -173,7 +173,7 @@ def _language_inputs(config: TicVlaConfig, name: str, index: int, rng: np.random
 
 
 def references(model: TicVla, name: str, count: int) -> list[Sample]:
-    """`count` different inputs of a graph with the outputs of PyTorch in fp32."""
+    """Build `count` different inputs of a graph with PyTorch's outputs in fp32."""
     samples = []
     for index in range(count):
         feeds = sample_inputs(model.config, name, index)
@@ -183,7 +183,7 @@ def references(model: TicVla, name: str, count: int) -> list[Sample]:
 
 
 def reference_outputs(model: TicVla, name: str, feeds: Arrays) -> Arrays:
-    """What the network computes for a graph's inputs, by the graph's output names."""
+    """Compute the network's outputs for a graph's inputs, by the graph's output names."""
     tensors = {key: torch.from_numpy(array) for key, array in feeds.items()}
     if name == "vision_encoder":
         return {"visual_tokens": model.vision(tensors["frame"]).numpy()}
@@ -216,7 +216,7 @@ def _language_outputs(model: TicVla, name: str, feeds: Arrays) -> Arrays:
 
 
 def save_samples(samples: Sequence[Sample], path: Path) -> None:
-    """Write test inputs and expected outputs to one safetensors file."""
+    """Write test inputs and expected outputs to a safetensors file."""
     tensors = {
         f"{index}/{kind}/{name}": np.ascontiguousarray(array)
         for index, sample in enumerate(samples)
@@ -227,7 +227,7 @@ def save_samples(samples: Sequence[Sample], path: Path) -> None:
 
 
 def load_samples(path: Path) -> list[Sample]:
-    """Inverse of `save_samples`."""
+    """Read what `save_samples` wrote."""
     samples: dict[int, Sample] = {}
     for key, array in load_file(path).items():
         index, kind, name = key.split("/", 2)
@@ -248,7 +248,7 @@ def save_outputs(outputs: StageOutputs, path: Path) -> None:
 
 
 def load_outputs(path: Path) -> StageOutputs:
-    """Inverse of `save_outputs`."""
+    """Read what `save_outputs` wrote."""
     tensors = load_file(path)
 
     def of(kind: str) -> tuple[Any, ...]:

@@ -1,7 +1,7 @@
-"""Readings of the task error when one graph, or one group of its layers, is rounded; everything else stays in fp32.
+"""Measures the task error when one graph, or one group of its layers, is rounded; all else stays in fp32.
 
-What does not change is computed once: the plan of the fp32 model, and the input of every block of the encoder and of
-every layer of the language model, so that rounding layer N costs only the layers from N on.
+The plans of the fp32 model and the inputs of every encoder block and language layer are computed once, so rounding
+layer N costs only the layers from N on.
 """
 
 from __future__ import annotations
@@ -41,20 +41,20 @@ from export.quantize.rounding import Rounder
 Floats = npt.NDArray[np.float32]
 
 TOKENS_COMPARED = 16
-"""Positions at the prompt's end whose most likely next token is compared: they are text, as an answer's are."""
+"""Positions at the prompt's end whose most likely next token is compared: text, as in an answer."""
 
 DECODE_INPUTS = 8
-"""Calls like the gate's that a decoding graph is held to: its tensors are judged there, after no exact prompt."""
+"""Number of calls as in the gate for a decoding graph: the gate judges its tensors without an exact prompt."""
 
 
 @dataclass(frozen=True)
 class Reading:
-    """Task error of one rounding over the search's moments; `top1` is None where no token is chosen."""
+    """Task error of one rounding over the search's moments; `top1` is None for a graph without tokens."""
 
     waypoint_cm: float
-    """Worst moment's mean deviation over the chunk."""
+    """Mean deviation over the chunk at the worst moment, cm."""
     heading_deg: float
-    """Worst moment's heading error at the end of the chunk."""
+    """Heading error at the end of the chunk at the worst moment, deg."""
     speed_mps: float
     turn_radps: float
     relative: float
@@ -65,7 +65,7 @@ class Reading:
 
 
 class Reference:
-    """What the fp32 model makes of the samples, kept for every graph's probe."""
+    """Outputs of the fp32 model for the samples, shared by all probes."""
 
     def __init__(self, model: TicVla, samples: SampleSet, progress: Callable[[str], None]) -> None:
         self.model = model
@@ -82,11 +82,11 @@ class Reference:
         self.spread_cm, self.spread_deg = spread(np.concatenate(self.plans))
 
     def prompt(self, index: int) -> list[Segment]:
-        """The prompt of a sample with its visual tokens."""
+        """Return a sample's prompt with its visual tokens."""
         return prompt_parts(self.samples.samples[index], self.visual)
 
     def reading(self, plans: Sequence[Floats], output_error: float, top1: float | None = None) -> Reading:
-        """Compare the plans of the first samples, or of all, with the fp32 model's."""
+        """Compare the plans of the first samples, or of all, with those of the fp32 model."""
         errors = compare_plans(self.plans[: len(plans)], plans, self.samples)
         waypoint, heading = errors["waypoint_cm"], errors["heading_deg"]
         shares = [
@@ -105,7 +105,7 @@ class Reference:
 
 
 class Probe(ABC):
-    """One graph of the model under rounding."""
+    """Rounds one graph of the model and reads the task error."""
 
     def __init__(self, reference: Reference, graph: str, rounder: Rounder, *, activations: bool) -> None:
         self.reference = reference
@@ -116,15 +116,15 @@ class Probe(ABC):
 
     @property
     def groups(self) -> tuple[str, ...]:
-        """Patterns over the graph's layers that are rounded together: a block, a decoder layer, a projection."""
+        """Return patterns of layers that are rounded together: a block, a decoder layer, a projection."""
         return tuple(dict.fromkeys(group_of(layer) for layer in self.layers))
 
     @abstractmethod
     def whole(self, precision: Precision) -> Reading:
-        """The graph in that precision."""
+        """Read the task error of the whole graph in a precision."""
 
     def group(self, group: str, precision: str) -> Reading:
-        """The graph with one group of layers in that precision."""
+        """Read the task error with one group of layers in a precision."""
         return self.whole(Precision("fp32", ((group, precision),)))
 
     def _rounded(self, part: nn.Module, precision: Precision) -> AbstractContextManager[None]:
@@ -132,12 +132,12 @@ class Probe(ABC):
 
 
 class VisionProbe(Probe):
-    """The encoder: its tokens feed the action expert now and the language model later."""
+    """Probe of the encoder: its tokens feed the action expert at once and the language model later."""
 
     def __init__(self, reference: Reference, graph: str, rounder: Rounder, *, activations: bool) -> None:
         super().__init__(reference, graph, rounder, activations=activations)
         newest = [sample.moments[0].frame for sample in reference.samples.samples]
-        # A block of a large encoder takes a fifth of a second a frame: one frame then ranks the blocks.
+        # A block of a large encoder takes 0.2 s per frame: one frame is enough to rank the blocks.
         self._scan_frames = sorted(set(newest))[: 1 if is_large(reference.model.config) else None]
         self._inputs: dict[int, list[Tensor]] = {}
 
@@ -155,7 +155,7 @@ class VisionProbe(Probe):
         return r.reading(plans, max(map(relative_error, r.visual, visual)))
 
     def group(self, group: str, precision: str) -> Reading:
-        """See `Probe`; the rounded tokens of the frames at the anchors, as the action expert sees them now."""
+        """See `Probe`; only the action expert's frames at the anchors are rounded."""
         r, vision = self.reference, self.reference.model.vision
         visual = list(r.visual)
         index = group.split(".")[1] if group.startswith("blocks.") else None
@@ -166,7 +166,7 @@ class VisionProbe(Probe):
                 else:
                     tokens = self._from_block(frame, len(vision.blocks) if index is None else int(index))
             visual[frame] = tokens.numpy()
-        # The same picture under every age of the state, so that each delay is seen with the few frames there are.
+        # Use the same picture for every age of the state: so each delay is tested with few frames.
         plans: list[Floats] = []
         exact: list[Floats] = []
         for i, (sample, context) in enumerate(zip(r.samples.samples, r.contexts, strict=True)):
@@ -174,7 +174,7 @@ class VisionProbe(Probe):
             for tokens_of, into in ((visual, plans), (r.visual, exact)):
                 into.append(plan(r.stages.act, sample, dict.fromkeys(range(len(visual)), tokens_of[frame]), context))
         errors = [relative_error(r.visual[frame], visual[frame]) for frame in self._scan_frames]
-        # `reading` compares with the plans of the true frames; moving them by the difference keeps that reference.
+        # `reading` compares with the plans of the true frames; shifting by the difference keeps that reference.
         moved = [base + found - expected for base, found, expected in zip(r.plans, plans, exact, strict=True)]
         return r.reading(moved, max(errors))
 
@@ -198,10 +198,10 @@ class VisionProbe(Probe):
 
 
 class LanguageProbe(Probe):
-    """The language model; as `language_model.decode` only the text at the prompt's end goes through the rounding.
+    """Probe of the language model; for `language_model.decode` only the text at the prompt's end is rounded.
 
-    That text stands for an answer's tokens, which decoding would feed one by one onto an exact cache. Its output error
-    is also that of the gate's calls, in which nothing is exact.
+    That text replaces an answer's tokens, which decoding would feed one by one onto an exact cache. The output error
+    also covers the gate's calls, in which all tokens are rounded.
     """
 
     def __init__(self, reference: Reference, graph: str, rounder: Rounder, *, activations: bool) -> None:
@@ -211,7 +211,7 @@ class LanguageProbe(Probe):
         self._runs = [self._prepare(index) for index in range(len(reference.samples.samples))]
 
     def _prepare(self, index: int) -> dict[str, Any]:
-        """The exact run of a prompt: layer inputs, what the layers share, K‖V that stays exact, chosen tokens."""
+        """Run a prompt exactly; returns layer inputs, the layers' shared tensors, exact K‖V and chosen tokens."""
         r, language = self.reference, self.reference.model.language
         prompt = r.prompt(index)
         past, head = empty_past(r.model), None
@@ -257,7 +257,7 @@ class LanguageProbe(Probe):
             return self._reading([(None, run["hidden"]) for run in self._runs], precision, calls_error)
         language, start = self.reference.model.language, int(group.split(".")[1])
         found: list[tuple[Tensor | None, Tensor]] = []
-        # One prompt ranks the layers of a large model; what is chosen in the end is read on all of them.
+        # One prompt is enough to rank the layers of a large model; the final choice is read on all prompts.
         for run in self._runs[: 1 if is_large(self.reference.model.config) else None]:
             x, cos, sin, mask, *_ = run["inputs"][start]
             with torch.no_grad(), self._rounded(language, Precision("fp32", ((group, precision),))):
@@ -269,7 +269,7 @@ class LanguageProbe(Probe):
         return self._reading(found, "fp32", calls_error)
 
     def _gate_calls(self) -> list[tuple[Tensor, list[Tensor], Floats, Floats]]:
-        """Ids, caches and what the exact model makes of them: logits and K‖V."""
+        """Return ids, caches, and the exact model's logits and K‖V for them."""
         calls = []
         for index in range(DECODE_INPUTS):
             feeds = sample_inputs(self.reference.model.config, self.graph, index)
@@ -289,7 +289,7 @@ class LanguageProbe(Probe):
         return logits.numpy(), kv.numpy()
 
     def _calls_error(self, precision: Precision) -> float:
-        """Largest relative error of those calls' logits and K‖V."""
+        """Return the largest relative error of those calls' logits and K‖V."""
         errors = [0.0]
         for ids, caches, *exact in self._calls:
             found = self._call(ids, caches, precision)
@@ -314,7 +314,7 @@ class LanguageProbe(Probe):
 
 
 class ActionProbe(Probe):
-    """`semantic_context` or `action_expert`: both are cheap enough to run whole every time."""
+    """Probe of `semantic_context` or `action_expert`, which are cheap enough to run whole every time."""
 
     def whole(self, precision: Precision) -> Reading:
         """See `Probe`."""
@@ -331,7 +331,7 @@ class ActionProbe(Probe):
 
 
 def probe(reference: Reference, graph: str, rounder: Rounder, *, activations: bool) -> Probe:
-    """The probe of a graph by its name; raises ValueError for an unknown graph."""
+    """Create the probe of a graph by name. Raises ValueError for an unknown graph."""
     if graph == "vision_encoder":
         return VisionProbe(reference, graph, rounder, activations=activations)
     if graph.split(".")[0] == "language_model":
@@ -340,8 +340,8 @@ def probe(reference: Reference, graph: str, rounder: Rounder, *, activations: bo
 
 
 def group_of(layer: str) -> str:
-    """`layers.3.down` → `layers.3.*`, `projector.1` → `projector.*`, `lm_head` → `lm_head`."""
+    """Return a layer's group: `layers.3.down` → `layers.3.*`, `projector.1` → `projector.*`, `lm_head` → `lm_head`."""
     parts = layer.split(".")
     if parts[0] == "flow":
-        return ".".join([*parts[:3], "*"])  # a coupling as a whole
+        return ".".join([*parts[:3], "*"])  # a coupling is one group
     return layer if len(parts) == 1 else ".".join([*parts[:-1], "*"])

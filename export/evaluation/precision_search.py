@@ -1,8 +1,8 @@
-"""Chooses every graph's precision by what rounding does to the robot's plan, with the reason in one sentence.
+"""Chooses every graph's precision by the task error of its rounding, and gives the reason in one sentence.
 
-From the smallest candidate up, the first whose task error stays within the limits is taken; its most sensitive groups
-of layers are raised to the next more exact candidate where that is enough. Nothing here is timed: the same inputs give
-the same decision.
+The search takes the smallest candidate whose task error stays within the limits. If raising the most sensitive groups
+of layers to the next more exact candidate is enough, it does that. It measures no time: the same inputs give the same
+decision.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from export.targets.sections import Measured
 
 SEARCH_DELAYS_S = (0.0, 3.0, 10.0)
 RELATIVE_LIMIT = 0.5
-"""Largest mean deviation as a share of the fp32 plans' spread. In effect untrained weights are judged by it alone."""
+"""Largest mean deviation as a share of the fp32 plans' spread; the only limit that matters for untrained weights."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """How far rounding one graph may move the plan and the command (a target's `[gates.task]`)."""
+    """Largest change of plan and command by rounding one graph (a target's `[gates.task]`)."""
 
     waypoint_cm: float
     heading_deg: float
@@ -40,9 +40,9 @@ class Limits:
     turn_radps: float
     relative: float = RELATIVE_LIMIT
     top1: float | None = None
-    """Smallest share of equal next tokens; only held against trained weights: untrained logits are nearly ties."""
+    """Smallest share of equal next tokens; ignored for untrained weights, whose logits are nearly equal."""
     output_error: float | None = None
-    """Largest change of the graph's own output, as a share of it: what the gate holds its tensors to."""
+    """Largest relative change of the graph's output, as in the gate."""
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
@@ -50,7 +50,7 @@ class Limits:
                 raise ValueError(f"limit {name} must be positive, found {value}")
 
     def load(self, reading: Reading, *, trained: bool) -> float:
-        """The largest of the reading's figures as a share of its limit; at most 1 is within the limits."""
+        """Return the largest figure of the reading as a share of its limit; at most 1 is within the limits."""
         names = ("waypoint_cm", "heading_deg", "speed_mps", "turn_radps", "relative")
         shares: list[float] = [getattr(reading, name) / getattr(self, name) for name in names]
         if trained and self.top1 is not None and reading.top1 is not None:
@@ -62,7 +62,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class SensitivityRow:
-    """Task error of a graph with one group of layers rounded (`*`: all of them, `raised` exempted)."""
+    """Task error of a graph with one group of layers rounded (`*`: all of them except `raised`)."""
 
     group: str
     precision: str
@@ -72,7 +72,7 @@ class SensitivityRow:
     speed_mps: float
     turn_radps: float
     relative: float | None
-    """None: the fp32 plans do not vary at all."""
+    """None: the fp32 plans do not vary."""
     output_error: float
     top1: float | None
     load: float | None
@@ -81,7 +81,7 @@ class SensitivityRow:
 
 @dataclass(frozen=True)
 class Dropped:
-    """A candidate that was not tried, and why."""
+    """Candidate that was not tried, with the reason."""
 
     precision: str
     reason: str
@@ -89,7 +89,7 @@ class Dropped:
 
 @dataclass(frozen=True)
 class Decision:
-    """The precision that a graph ships in."""
+    """Chosen precision of a graph."""
 
     graph: str
     precision: Precision
@@ -99,17 +99,17 @@ class Decision:
     weight_bytes: int
     dropped: tuple[Dropped, ...]
     table: tuple[SensitivityRow, ...]
-    """Whole graphs in the order they were tried, then groups from the most to the least sensitive."""
+    """Whole graphs in the order of the search, then groups from the most to the least sensitive."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON form."""
+        """Return plain JSON form."""
         return {**asdict(self), "precision": self.precision.to_dict()}
 
 
 def search_samples(
     calibration: CalibrationSet, config: TicVlaConfig, frame_offsets_s: Sequence[float], tokenizer: bytes
 ) -> SampleSet:
-    """The samples of the search: one anchor a clip, or two in a single one, and three delays.
+    """Return the samples of the search: one anchor per clip (two for a single clip) and three delays.
 
     A large model gets two clips and one frame a prompt.
     """
@@ -123,9 +123,9 @@ def search_samples(
 
 
 class Search:
-    """Decisions for the graphs of one model, sharing what the fp32 model makes of the samples.
+    """Search for the precisions of one model's graphs, with shared outputs of the fp32 model.
 
-    Set the number of torch threads before: another number sums in another order and may change a last digit.
+    Set the number of torch threads before: it changes the order of sums and so the last digit.
     """
 
     def __init__(
@@ -145,16 +145,16 @@ class Search:
         measured: Sequence[Measured] = (),
         speed_first: bool = False,
     ) -> Decision:
-        """Decide for one graph; `candidates` run from the most exact to the smallest. See `drop_dominated`.
+        """Choose one graph's precision; `candidates` are ordered from the most exact to the smallest.
 
-        `int8` layers are tried with their inputs rounded too, in every form: the fused kernels do that, and so does the
-        plain form of the encoder. Where a plain graph rounds weights alone, the decision errs on the exact side.
+        `int8` layers are tried with rounded inputs in every form, as the fused kernels and the encoder's plain form
+        compute. For a plain graph that rounds only weights, the choice is too exact rather than too coarse.
         """
         if not candidates:
             raise ValueError(f"{graph}: no candidates to choose a precision from")
         sizes = {c: self.bytes_of(graph, Precision(c)) for c in candidates}
         kept, dropped = drop_dominated(graph, candidates, sizes, measured, speed_first=speed_first)
-        # The rounded weights of one graph at a time: kept for all, they would take as much memory as the model.
+        # Keep the rounded weights of one graph at a time: those of all would take as much memory as the model.
         found = probe(self._reference, graph, Rounder(), activations=True)
         trial = _Trial(found, limits, self.trained, self._progress)
         precision, within = _smallest_within(trial, kept)
@@ -170,7 +170,7 @@ class Search:
         )
 
     def bytes_of(self, graph: str, precision: Precision) -> int:
-        """Bytes of the graph's linear layers in a precision."""
+        """Return the bytes of the graph's linear layers in a precision."""
         part: nn.Module = self._model.vision if graph == "vision_encoder" else self._model.action
         if graph.split(".")[0] == "language_model":
             part = self._model.language
@@ -179,7 +179,7 @@ class Search:
             module, of = part.get_submodule(layer), precision.of(layer)
             assert isinstance(module.weight, nn.Parameter)
             if isinstance(module, nn.Embedding) and of not in ("fp32", "fp16"):
-                of = "int8"  # a token table is stored in 8 bits at least
+                of = "int8"  # a token table has 8 bits or more
             rows = module.weight.shape[0]
             total += weight_bytes(of, rows, module.weight.numel() // rows)
         return total
@@ -193,10 +193,10 @@ def drop_dominated(
     *,
     speed_first: bool = False,
 ) -> tuple[tuple[str, ...], tuple[Dropped, ...]]:
-    """Candidates without those that are neither smaller nor faster than a more exact one, and why they went.
+    """Drop candidates that are neither smaller nor faster than a more exact one; returns the rest and the reasons.
 
-    Faster counts only when the target's measured points say so, never by timing here. With `speed_first` (graphs that
-    compute rather than read weights) a candidate that was measured slower than a more exact one goes although smaller.
+    Only the target's measured points decide which is faster; nothing is timed here. With `speed_first` (graphs limited
+    by computing, not by reading weights) a candidate measured slower than a more exact one is dropped even if smaller.
     """
     kept: list[str] = []
     dropped: list[Dropped] = []
@@ -205,7 +205,7 @@ def drop_dominated(
         for exact in kept:
             a, b = _time(graph, exact, measured), _time(graph, candidate, measured)
             smaller = sizes_bytes[candidate] < sizes_bytes[exact]
-            times = "no measured time says it is faster"
+            times = "no measured time shows that it is faster"
             faster = slower = False
             if a is not None and b is not None:
                 times, faster, slower = f"{b:.4g} against {a:.4g} ms", b < a, b > a
@@ -222,7 +222,7 @@ def drop_dominated(
 
 
 def _time(graph: str, precision: str, measured: Sequence[Measured]) -> float | None:
-    """Best measured time in ms, of a call or of a token."""
+    """Return the best measured time of a call or of a token, ms."""
     times: list[float] = []
     for point in measured:
         if point.graph == graph and point.precision == precision:
@@ -231,11 +231,11 @@ def _time(graph: str, precision: str, measured: Sequence[Measured]) -> float | N
 
 
 UNRANKED_BITS = 16
-"""A graph that keeps the limits in this many bits is not searched for its most sensitive layers."""
+"""Bits from which a graph within the limits is not searched for its most sensitive layers."""
 
 
 class _Trial:
-    """Readings of one graph, each taken once."""
+    """Readings of one graph, each computed once."""
 
     def __init__(self, found: Probe, limits: Limits, trained: bool, progress: Callable[[str], None]) -> None:
         self.probe = found
@@ -246,7 +246,7 @@ class _Trial:
         self.ranked: tuple[SensitivityRow, ...] = ()
 
     def whole(self, precision: Precision) -> SensitivityRow:
-        """The graph in a precision with overrides."""
+        """Read the task error of the graph in a precision with overrides."""
         if precision not in self.wholes:
             raised = tuple(pattern for pattern, _ in precision.overrides)
             self._progress(f"sensitivity: {self.probe.graph} in {precision.default}, {len(raised)} groups raised")
@@ -254,14 +254,14 @@ class _Trial:
         return self.wholes[precision]
 
     def rank(self, precision: str) -> tuple[SensitivityRow, ...]:
-        """Every group alone in a precision, the most sensitive first."""
+        """Read the task error of every group alone in a precision; the most sensitive first."""
         if not self.ranked:
             rows = []
             groups = self.probe.groups
             for number, group in enumerate(groups):
                 self._progress(f"sensitivity: {self.probe.graph} {group} in {precision}, {number + 1}/{len(groups)}")
                 rows.append(self._row(group, precision, (), self.probe.group(group, precision)))
-            # Equal loads keep the graph's order; the output's own error decides between groups that no limit feels.
+            # Equal loads keep the graph's order; the output error decides between groups without effect on the limits.
             rows.sort(key=lambda row: (-_sortable(row.load), -_sortable(row.output_error)))
             self.ranked = tuple(rows)
         return self.ranked
@@ -275,18 +275,18 @@ class _Trial:
 
 
 def _smallest_within(trial: _Trial, kept: Sequence[str]) -> tuple[Precision, bool]:
-    """The smallest candidate within the limits, with as few groups raised as that takes."""
+    """Find the smallest candidate within the limits, with as few raised groups as possible."""
     if len(kept) == 1:
         return Precision(kept[0]), _within(trial, Precision(kept[0]))
     if bits(kept[-1]) >= UNRANKED_BITS and _within(trial, Precision(kept[-1])):
         return Precision(kept[-1]), True
-    # The groups are ranked once, where rounding hurts most: their order hardly depends on the precision.
+    # Rank the groups once, at the coarsest precision: their order hardly depends on it.
     ranked = trial.rank(kept[-1])
     for index in range(len(kept) - 1, 0, -1):
         default, exact = kept[index], kept[index - 1]
         if _within(trial, Precision(default)):
             return Precision(default), True
-        # Raised in doubling numbers: if half of the groups must be raised, the next candidate is the plainer answer.
+        # Double the number of raised groups; if half must be raised, the next candidate is the simpler choice.
         count = 1
         while count <= len(ranked) // 2:
             if _within(trial, _raised(default, exact, ranked, count)):
@@ -296,7 +296,7 @@ def _smallest_within(trial: _Trial, kept: Sequence[str]) -> tuple[Precision, boo
 
 
 def _fewest(trial: _Trial, default: str, exact: str, ranked: Sequence[SensitivityRow], enough: int) -> int:
-    """The smallest number of raised groups between `enough`/2, which is too few, and `enough`."""
+    """Find the smallest sufficient number of raised groups between `enough`/2, which is too small, and `enough`."""
     low, high = enough // 2, enough
     while high - low > 1:
         middle = (low + high) // 2
@@ -349,7 +349,7 @@ def _reason(trial: _Trial, search: Search, graph: str, precision: Precision, kep
     if size != exact:
         parts.append(f"{_mb(size)} instead of {_mb(exact)} in {kept[0]}")
     if not search.trained:
-        parts.append("untrained weights: of these only the share of the spread means anything")
+        parts.append("untrained weights: of these limits only the share of the spread is meaningful")
     return "; ".join(parts)
 
 

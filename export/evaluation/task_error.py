@@ -1,7 +1,7 @@
-"""The metric that decides: how far the robot's plan and command move when a graph is rounded, by age of the KV cache.
+"""Task error: the change of the robot's plan and command when a graph is rounded, by age of the KV cache.
 
-Every number is a difference to the fp32 model on the same samples, given also as a share of how much that model's own
-plans vary: an untrained model plans nearly the same whatever it sees, and would make any rounding look exact.
+Every number is a difference to the fp32 model on the same samples, also as a share of the spread of that model's plans:
+the plans of an untrained model hardly depend on its inputs, so every rounding would seem exact.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ Context: TypeAlias = tuple[Floats, Floats]
 Visual: TypeAlias = Sequence[Floats] | Mapping[int, Floats]
 """Visual tokens by frame."""
 Act: TypeAlias = Callable[[Floats, Floats, Floats, Floats, Floats], Floats]
-"""`TorchStages.act`, or a graph in its place."""
+"""Signature of `TorchStages.act`, also for a graph in its place."""
 
 
 class TaskErrorError(ValueError):
-    """Outputs that cannot be compared: not finite, or of another shape than the reference's."""
+    """Outputs that cannot be compared: not finite, or of a different shape than the reference."""
 
 
 def prompt_tensors(model: TicVla, prompt: Sequence[Segment]) -> tuple[Tensor, Tensor]:
-    """Ids [1, T] and visual tokens [F, N, D] of a whole prompt, for one call."""
+    """Return ids [1, T] and visual tokens [F, N, D] of a whole prompt, for one call."""
     ids = torch.tensor([[token for segment in prompt for token in segment.ids]])
     frames = [torch.from_numpy(segment.tokens) for segment in prompt if segment.tokens is not None]
     vision = model.config.vision
@@ -50,13 +50,13 @@ def prompt_tensors(model: TicVla, prompt: Sequence[Segment]) -> tuple[Tensor, Te
 
 
 def empty_past(model: TicVla) -> list[Tensor]:
-    """KV caches before the first token."""
+    """Return empty KV caches."""
     c = model.config.language
     return [torch.zeros(1, c.kv_heads, 0, c.head_dim) for _ in range(2 * c.layers)]
 
 
 class TorchStages:
-    """The torch model in the calls that the runtime makes; the graphs named in `precisions` are rounded."""
+    """PyTorch model with the runtime's calls; the graphs in `precisions` are rounded."""
 
     def __init__(
         self,
@@ -72,14 +72,14 @@ class TorchStages:
         self._activations = activations
 
     def encode(self, frame: npt.NDArray[np.uint8]) -> Floats:
-        """Frame [1, px, px, 3] → visual tokens [1, N, D]."""
+        """Encode a frame [1, px, px, 3] to visual tokens [1, N, D]."""
         with torch.no_grad(), self._graph("vision_encoder", self.model.vision):
             return _array(self.model.vision(torch.from_numpy(frame)))
 
     def language(self, prompt: Sequence[Segment], new_tokens: int) -> tuple[Floats, tuple[int, ...]]:
-        """K‖V of the last layer for every prompt token [1, T, kv_dim], and the first `new_tokens` greedy tokens.
+        """Return the last layer's K‖V of every prompt token [1, T, kv_dim] and the first `new_tokens` greedy tokens.
 
-        The prompt goes through one call, which chunks would not change.
+        The prompt is one call; chunks would give the same result.
         """
         ids, visual = prompt_tensors(self.model, prompt)
         language, end = self.model.language, self.model.config.language.im_end_id
@@ -95,13 +95,13 @@ class TorchStages:
         return _array(kv), tuple(found)
 
     def context(self, guidance: Floats) -> tuple[Floats, Floats]:
-        """K‖V or waypoints → keys and values of every cross-attention layer, [layers, 1, heads, T, d] each."""
+        """Project K‖V or waypoints to every cross-attention layer's keys and values, [layers, 1, heads, T, d] each."""
         with torch.no_grad(), self._graph("semantic_context", self.model.action):
             keys, values = self.model.action.context(torch.from_numpy(guidance))
         return _array(keys), _array(values)
 
     def act(self, visual_tokens: Floats, state: Floats, latency: Floats, keys: Floats, values: Floats) -> Floats:
-        """Visual tokens, state [1, 3], latency [1, 4] and context → trajectory [1, steps, 3]."""
+        """Plan a trajectory [1, steps, 3] from visual tokens, state [1, 3], latency [1, 4] and context."""
         tensors = [torch.from_numpy(array) for array in (visual_tokens, state, latency, keys, values)]
         with torch.no_grad(), self._graph("action_expert", self.model.action):
             return _array(self.model.action(*tensors))
@@ -120,7 +120,7 @@ def _array(tensor: Tensor) -> Floats:
 
 @dataclass(frozen=True)
 class StageOutputs:
-    """Everything one implementation gave over a sample set."""
+    """Outputs of one implementation for a sample set."""
 
     visual: tuple[Floats, ...]
     """By frame."""
@@ -130,7 +130,7 @@ class StageOutputs:
     trajectories: tuple[Floats, ...]
     """By sample: [moments, steps, 3]."""
     swapped: tuple[Floats, ...]
-    """The same moments under the semantic context of the next sample (negative control)."""
+    """Trajectories of the same moments with the next sample's semantic context (negative control)."""
 
 
 def run_stages(
@@ -161,19 +161,19 @@ def run_stages(
 
 
 def prompt_parts(sample: Sample, visual: Visual) -> list[Segment]:
-    """The sample's prompt with its frames' visual tokens."""
+    """Return a sample's prompt with its frames' visual tokens."""
     return [Segment(part.ids, None if part.frame is None else visual[part.frame]) for part in sample.prompt]
 
 
 def moment_contexts(context: Callable[[Floats], Context], sample: Sample, last_layer_kv: Floats) -> list[Context]:
-    """The semantic context at every moment of a sample: K‖V's does not change, waypoints' moves with the robot."""
+    """Return the semantic context at every moment: that of K‖V is constant, that of waypoints moves with the robot."""
     if sample.waypoints is None:
         return [context(last_layer_kv)] * len(sample.moments)
     return [context(waypoints_now(sample.waypoints, moment.offset)) for moment in sample.moments]
 
 
 def plan(act: Act, sample: Sample, visual: Visual, contexts: Sequence[Context]) -> Floats:
-    """Trajectories [moments, steps, 3] of a sample under the semantic context of every moment."""
+    """Plan trajectories [moments, steps, 3] of a sample with the semantic context of every moment."""
     planned = [
         act(
             visual[moment.frame],
@@ -188,7 +188,7 @@ def plan(act: Act, sample: Sample, visual: Visual, contexts: Sequence[Context]) 
 
 @dataclass(frozen=True)
 class TaskResult:
-    """What rounding does to the robot: the worst moment over all delays of the semantic state."""
+    """Effect of rounding on the robot at the worst moment over all delays of the semantic state."""
 
     waypoint_cm: float
     """Mean deviation over the chunk."""
@@ -197,26 +197,26 @@ class TaskResult:
     speed_mps: float
     turn_radps: float
     relative: float | None
-    """Mean deviation as a share of how much the model's own plans vary (waypoints or heading, the larger); None when
-    they do not vary."""
+    """Mean deviation as a share of the spread of the model's plans (waypoints or heading, the larger); None if they
+    do not vary."""
     by_delay_cm: tuple[tuple[float, float], ...]
     """(Δt in s, worst moment's waypoint deviation in cm) in order of Δt."""
     token_agreement: float | None = None
-    """Mean share of the first greedy tokens before the first that differs; None for a graph that writes no text."""
+    """Mean share of the greedy tokens before the first difference; None for a graph without text."""
     kv_cosine: float = 1.0
-    """Of the semantic state to the exact one, lowest over the samples."""
+    """Cosine of the semantic state to the exact one, lowest over the samples."""
     semantic: float | None = None
-    """How far another semantic state moves the exact plans, as a share of how much they vary; None: they do not."""
+    """Change of the exact plans by another semantic state, as a share of their spread; None if they do not vary."""
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> TaskResult:
-        """Inverse of `asdict`, also through JSON."""
+        """Build the result from its `asdict` form, also after JSON."""
         pairs = tuple((float(delay_s), float(cm)) for delay_s, cm in content["by_delay_cm"])
         return cls(**{**content, "by_delay_cm": pairs})
 
 
 def compare(reference: StageOutputs, found: StageOutputs, samples: SampleSet) -> TaskResult:
-    """Task error of a candidate's outputs; raises TaskErrorError."""
+    """Compute the task error of a candidate's outputs. Raises TaskErrorError."""
     errors = compare_plans(reference.trajectories, found.trajectories, samples)
     agreement = [_agreement(a, b) for a, b in zip(reference.token_ids, found.token_ids, strict=True) if a]
     delays = np.array([moment.delay_s for sample in samples.samples for moment in sample.moments])
@@ -237,7 +237,7 @@ def compare(reference: StageOutputs, found: StageOutputs, samples: SampleSet) ->
 
 
 def compare_plans(reference: Sequence[Floats], found: Sequence[Floats], samples: SampleSet) -> dict[str, Floats]:
-    """Deviation of every moment by the names of `TaskResult`'s figures; raises TaskErrorError."""
+    """Compute every moment's deviations, named as in `TaskResult`. Raises TaskErrorError."""
     a, b = np.concatenate(list(reference)).astype(np.float64), np.concatenate(list(found)).astype(np.float64)
     if a.shape != b.shape:
         raise TaskErrorError(f"trajectories are {list(b.shape)}, the reference's {list(a.shape)}")
@@ -260,22 +260,22 @@ def _command(point: npt.NDArray[np.float64]) -> tuple[float, float]:
 
 
 def spread(trajectories: Floats) -> tuple[float, float]:
-    """RMS distance (cm) and RMS end heading (deg) of trajectories [n, steps, 3] to their mean."""
+    """Return RMS distance (cm) and RMS end heading (deg) of trajectories [n, steps, 3] to their mean."""
     centred = trajectories.astype(np.float64) - trajectories.astype(np.float64).mean(axis=0)
     distance_cm = 100 * math.sqrt(float((centred[..., :2] ** 2).sum(axis=-1).mean()))
     return short(distance_cm), short(math.degrees(math.sqrt(float((centred[:, -1, 2] ** 2).mean()))))
 
 
 def cosine(a: Floats, b: Floats) -> float:
-    """Cosine of two arrays as vectors; 1 only for equal ones when a norm is zero."""
+    """Return the cosine of two arrays as vectors; if a norm is zero, 1 for equal arrays, else 0."""
     x, y = a.ravel().astype(np.float64), b.ravel().astype(np.float64)
-    # Plain sums: a threaded BLAS would add in an order that depends on the machine, and on a busy one takes longer.
+    # Plain sums: a threaded BLAS adds in an order that depends on the machine.
     norm = math.sqrt(float((x * x).sum()) * float((y * y).sum()))
     return float((x * y).sum()) / norm if norm > 0 else float(np.array_equal(x, y))
 
 
 def relative_error(reference: Floats, found: Floats) -> float:
-    """‖found − reference‖ / ‖reference‖; raises TaskErrorError for another shape or values that are not finite."""
+    """Return ‖found − reference‖ / ‖reference‖. Raises TaskErrorError if shapes differ or a value is not finite."""
     if reference.shape != found.shape or not np.isfinite(found).all():
         raise TaskErrorError(f"semantic state is not finite or {list(found.shape)}, expected {list(reference.shape)}")
     squares = [float((x.astype(np.float64) ** 2).sum()) for x in (found - reference, reference)]
@@ -298,5 +298,5 @@ def _share(value: float, of: float) -> float:
 
 
 def short(value: float, digits: int = 4) -> float:
-    """The value with that many significant digits: more are noise and would differ between machines."""
+    """Round to significant digits: further digits are noise and differ between machines."""
     return float(f"{float(value):.{digits}g}")

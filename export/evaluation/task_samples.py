@@ -1,7 +1,7 @@
-"""Situations in which the robot is driven by an old semantic state: what the task error is measured on (paper §3.2).
+"""Samples of the task error: situations in which the robot drives with an old semantic state (paper §3.2).
 
-A sample is one generation (frames at t, t−3, t−6, t−9 s, its prompt) and moments after it, Δt = 0…10 s: the frame of
-that moment, the robot's state, and how far it has moved since the generation's newest frame was captured.
+A sample is one generation (prompt with frames at t, t−3, t−6, t−9 s) and moments after it, Δt = 0…10 s: the frame of
+that moment, the robot's state, and its motion since the capture of the generation's newest frame.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Picture = npt.NDArray[np.uint8]
 
 DELAYS_S = (0.0, 1.0, 2.0, 3.0, 5.0, 7.0, 10.0)
 LARGE_FRAME_MACS = 2e10
-"""Multiply-adds of one encoder frame from which a model counts as large: one sample a clip then takes minutes."""
+"""Multiply-adds of one encoder frame above which a model counts as large: one sample per clip then takes minutes."""
 FRAME_TOLERANCE_S = 0.6
 
 
@@ -49,7 +49,7 @@ class Moment:
 
 @dataclass(frozen=True)
 class PromptPart:
-    """Consecutive prompt tokens and the frame (index into `SampleSet.frames`) whose places are among them."""
+    """Consecutive prompt tokens and the frame (index into `SampleSet.frames`) whose tokens they contain."""
 
     ids: tuple[int, ...]
     frame: int | None
@@ -57,14 +57,14 @@ class PromptPart:
 
 @dataclass(frozen=True)
 class Sample:
-    """One generation and the moments that are driven by it."""
+    """One generation and the moments that use its semantic state."""
 
     name: str
     prompt: tuple[PromptPart, ...]
     moments: tuple[Moment, ...]
     waypoints: tuple[tuple[float, float], ...] | None = None
-    """For a model that is guided by waypoints: where the clip's robot was 3, 6 and 9 s after the anchor, in the robot's
-    frame there. They stand for what the language model would have written; None: guided by K‖V."""
+    """For a model guided by waypoints: the recorded positions 3, 6 and 9 s after the anchor, in the robot frame at the
+    anchor, in place of the language model's waypoints; None for a model guided by K‖V."""
 
 
 @dataclass(frozen=True)
@@ -74,16 +74,16 @@ class SampleSet:
     frames: tuple[Picture, ...]
     samples: tuple[Sample, ...]
     step_s: float
-    """Time between two points of a planned trajectory."""
+    """Time between two points of a planned trajectory, s."""
 
     @property
     def moments(self) -> int:
-        """Number of planned trajectories that are compared."""
+        """Number of compared trajectories."""
         return sum(len(sample.moments) for sample in self.samples)
 
 
 def is_large(config: TicVlaConfig) -> bool:
-    """Whether one encoder frame of the model takes seconds rather than milliseconds on a CPU."""
+    """Return whether one encoder frame of the model takes seconds on a CPU."""
     vision = config.vision
     block = 4 * vision.hidden**2 + 2 * vision.hidden * vision.mlp
     return vision.layers * block * vision.grid**2 > LARGE_FRAME_MACS
@@ -98,9 +98,9 @@ def samples_from(
     delays_s: Sequence[float] = DELAYS_S,
     anchors_per_clip: int | None = None,
 ) -> SampleSet:
-    """Samples of every clip: one anchor a clip for a large model, else, or of a single clip, two.
+    """Build samples of every clip: two anchors per clip, one for a large model unless there is a single clip.
 
-    A large model so needs ten encoder frames and one prefill a clip, all delays of an anchor share its prefill.
+    All delays of an anchor share its prefill, so a large model needs ten encoder frames and one prefill per clip.
     Raises CalibrationError.
     """
     language = config.language
@@ -126,7 +126,7 @@ def samples_from(
                 EncodedFrame(clip.frames[i].stamp_ns, clip.frames[i].T_odom_base, np.zeros(1, np.float32))
                 for i in indices
             ]
-            # The builder gives one segment a frame, then the tail: the frames' places follow from the order.
+            # The builder returns one segment per frame, then the tail, so the order gives each frame's tokens.
             way = past_path_of((frame.stamp_ns, frame.T_odom_base) for frame in clip.frames[: indices[-1] + 1])
             segments = builder.build(encoded, clip.instruction, way)
             places = [index_of(number, i) for i in indices]
@@ -164,12 +164,12 @@ def _anchors(clip: Clip, history_s: float, future_s: float, count: int) -> list[
         )
     last_s = max(first_s, last_s)
     if last_s - first_s < FRAME_TOLERANCE_S:
-        count = 1  # all would be the same frames
+        count = 1  # all would use the same frames
     return [first_s + i * (last_s - first_s) / max(1, count - 1) for i in range(count)]
 
 
 def check_clips(calibration: CalibrationSet, frame_offsets_s: Sequence[float]) -> None:
-    """Raise CalibrationError if the clips are too short for a target's frames and every delay: before any work."""
+    """Check that the clips are long enough for a target's frames and every delay. Raises CalibrationError."""
     history_s, future_s = max(frame_offsets_s), max(DELAYS_S)
     anchors = [anchor_s for clip in calibration.clips for anchor_s in _anchors(clip, history_s, future_s, 2)]
     if len(anchors) < 2:
@@ -193,5 +193,5 @@ def _pose(clip: Clip, time_s: float) -> SE2:
 
 
 def _offset(clip: Clip, anchor_s: float, time_s: float) -> SE2:
-    """Motion from the anchor to `time_s` after it, in the robot frame at the anchor."""
+    """Return the motion from the anchor to `time_s` after it, in the robot frame at the anchor."""
     return _pose(clip, anchor_s).inverse() @ _pose(clip, anchor_s + time_s)

@@ -1,6 +1,6 @@
-"""The action expert's two graphs: what depends on the semantic state alone, and what changes every tick.
+"""The action expert's two graphs: one depends on the semantic state alone, the other runs in every tick.
 
-A head's loop is unrolled and its noise is stored: no loop and no chance is left in a graph.
+A head's loop is unrolled and its noise is stored, so the graphs have no loop and no randomness.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ TOKENS = "T"
 
 
 def context_shapes(config: TicVlaConfig) -> dict[str, tuple[int | str, ...]]:
-    """Tensors of the semantic context: a layer's keys lie as its product reads them, [1, H, d, T]."""
+    """Return name → shape of the semantic context's tensors; keys are [1, H, d, T], as the product reads them."""
     c = config.action
     head_dim = c.hidden // c.heads
     tokens = guidance_input(config)[1][1]
@@ -39,7 +39,7 @@ def context_shapes(config: TicVlaConfig) -> dict[str, tuple[int | str, ...]]:
 
 
 def guidance_input(config: TicVlaConfig) -> tuple[str, tuple[int | str, ...]]:
-    """Name and shape of what the semantic context is made from: `last_layer_kv` or `waypoints`."""
+    """Return name and shape of the semantic context's input: `last_layer_kv` or `waypoints`."""
     if config.action.semantic_interface == "waypoints":
         return "waypoints", (1, config.guidance_tokens, config.guidance_width)
     return "last_layer_kv", (1, TOKENS, config.kv_dim)
@@ -101,7 +101,7 @@ def write_action(action: ActionExpert, directory: Path, *, precision: Precision,
 
 
 def _features(g: GraphWriter, action: ActionExpert, now: str, split: str) -> str:
-    """What each step's query finds in the present and the semantic context, whose lengths `split` gives."""
+    """Attend with each step's query to the present and the semantic context, of lengths `split`."""
     x: str | None = None
     for i, (pair, layer) in enumerate(zip(action.key_values, action.layers, strict=True)):
         name = f"layers.{i}"
@@ -117,7 +117,7 @@ def _features(g: GraphWriter, action: ActionExpert, now: str, split: str) -> str
 
 
 def _now_tokens(g: GraphWriter, action: ActionExpert, visual: str, state: str, latency: str) -> str:
-    """Tokens of the present [1, N + 2, hidden]."""
+    """Write the tokens of the present [1, N + 2, hidden]."""
     c = action.config.action
     if not c.latency_aware:
         latency = g.op("Mul", [latency, g.constant(np.zeros(4, np.float32))])
@@ -137,7 +137,7 @@ def _now_tokens(g: GraphWriter, action: ActionExpert, visual: str, state: str, l
 
 
 def _first_query(action: ActionExpert, layer: CrossAttentionLayer) -> Array:
-    """The first layer's queries do not depend on any input: [1, heads, steps, d], computed here once for all."""
+    """Compute the first layer's queries [1, heads, steps, d], which depend on no input, as a constant."""
     c = action.config.action
     weight, bias = query_weights(layer)
     queries = action.queries.detach().float()
@@ -147,7 +147,7 @@ def _first_query(action: ActionExpert, layer: CrossAttentionLayer) -> Array:
 
 
 def _trajectory(g: GraphWriter, steps: str, parameterisation: str) -> None:
-    """Increments are summed into poses; offsets are positions already and only their headings are summed."""
+    """Sum increments into poses; of offsets, which are positions, sum only the headings."""
     axis = g.constant(1)
     if parameterisation == "increments":
         g.op("CumSum", [steps, axis], out="trajectory")
@@ -158,10 +158,10 @@ def _trajectory(g: GraphWriter, steps: str, parameterisation: str) -> None:
 
 
 def denoised(g: GraphWriter, action: ActionExpert, diffusion: Diffusion, now: str, split: str) -> str:
-    """Tokens of the present → normalised actions [1, steps, 3] in fp32; `split`: lengths of present, context, chunk.
+    """Write the denoising passes: tokens of the present → normalised actions [1, steps, 3] in fp32.
 
-    Keys and values of the present and of the semantic context are made once for all passes. Actions stay in fp32
-    between the layers: they are few, and each pass builds on the one before.
+    `split`: lengths of present, context and chunk. All passes share the keys and values of present and context. Actions
+    stay in fp32 between the layers, because errors would add up over the passes.
     """
     c = action.config.action
     present = [key_values(g, now, f"key_values.{i}", pair) for i, pair in enumerate(action.key_values)]
@@ -185,7 +185,7 @@ def _clean(
     present: list[tuple[str, str]],
     split: str,
 ) -> str:
-    """One pass of the denoiser."""
+    """Write one pass of the denoiser."""
     with torch.no_grad():
         places = action.queries + diffusion.time_tokens(torch.tensor([time]))
     x = g.linear(g.from_float32(noisy), "diffusion.action_in", *weights(diffusion.action_in))
@@ -201,7 +201,7 @@ def _clean(
 
 
 def flowed(g: GraphWriter, flow: Flow, features: str) -> str:
-    """Features [1, steps, hidden] → normalised actions [1, steps, 3] in fp32."""
+    """Write the flow: features [1, steps, hidden] → normalised actions [1, steps, 3] in fp32."""
     steps = flow.noise.shape[1]
     halves = [g.constant(array(half), "noise") for half in halved(flow.noise)]
     end, axis, stride = (g.constant([value]) for value in (steps, 1, 2))
@@ -220,7 +220,7 @@ def flowed(g: GraphWriter, flow: Flow, features: str) -> str:
 def _affine(
     g: GraphWriter, name: str, coupling: Coupling, given: str, given_features: str, features: str
 ) -> tuple[str, str]:
-    """Logarithm of the scale before it is bounded, and shift, in fp32."""
+    """Write the unbounded logarithm of the scale, and the shift, in fp32."""
     layer = coupling.layer
     own = g.linear(g.from_float32(given), f"{name}.action_in", *weights(coupling.action_in))
     keys, values = key_values(g, g.op("Add", [given_features, own]), f"{name}.key_value", coupling.key_value)
@@ -234,12 +234,12 @@ def _affine(
 
 
 def weights(module: nn.Linear) -> tuple[Array, Array]:
-    """Weight [out, in] and bias [out]."""
+    """Return weight [out, in] and bias [out] of a layer."""
     return array(module.weight), array(module.bias)
 
 
 def mlp(g: GraphWriter, x: str, name: str, module: nn.Sequential) -> str:
-    """A `projection`."""
+    """Write a `projection`."""
     first, _, second = module
     assert isinstance(first, nn.Linear) and isinstance(second, nn.Linear)
     x = g.op("Gelu", [g.linear(x, f"{name}.0", *weights(first))])
@@ -247,21 +247,21 @@ def mlp(g: GraphWriter, x: str, name: str, module: nn.Sequential) -> str:
 
 
 def key_values(g: GraphWriter, tokens: str, name: str, pair: KeyValue) -> tuple[str, str]:
-    """Keys [1, heads, d, T], as their product reads them, and values [1, heads, T, d] of tokens [1, T, hidden]."""
+    """Write keys [1, heads, d, T] and values [1, heads, T, d] of tokens [1, T, hidden]."""
     k = g.linear(tokens, f"{name}.k", *weights(pair.k))
     v = g.linear(tokens, f"{name}.v", *weights(pair.v))
     return split_heads(g, k, pair.heads, keys=True), split_heads(g, v, pair.heads)
 
 
 def query_weights(layer: CrossAttentionLayer) -> tuple[Array, Array]:
-    """Weight and bias of the queries, the softmax's scale included."""
+    """Return weight and bias of the queries, multiplied by the softmax's scale."""
     scale = np.float32((layer.q.out_features // layer.heads) ** -0.5)
     weight, bias = weights(layer.q)
     return weight * scale, bias * scale
 
 
 def query(g: GraphWriter, normed: str, name: str, layer: CrossAttentionLayer) -> str:
-    """Queries [1, heads, S, d] of normed tokens [1, S, hidden]."""
+    """Write the queries [1, heads, S, d] of normed tokens [1, S, hidden]."""
     return split_heads(g, g.linear(normed, f"{name}.q", *query_weights(layer)), layer.heads)
 
 
@@ -275,10 +275,10 @@ def attend(
     values: Sequence[str],
     split: str | None = None,
 ) -> str:
-    """Tokens [1, S, hidden] after a layer with queries `q` over sets of keys and values; `split`: the sets' lengths.
+    """Write a layer with queries `q` over sets of keys and values of lengths `split`; returns tokens [1, S, hidden].
 
-    Nothing is concatenated along the tokens: scores against each set are joined before the softmax and parted again
-    after it. That is the same sum in another order, hence exact up to rounding.
+    Keys and values are not concatenated: the scores of the sets are joined before the softmax and split after it. This
+    is the same sum in another order, exact up to rounding.
     """
     scores = [g.op("MatMul", [q, k]) for k in keys]
     if split is None:

@@ -1,4 +1,4 @@
-"""Every graph of an artifact directory by name (design §5)."""
+"""Writes the graphs of an artifact directory by name (design §5)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ WEIGHT_TYPES = frozenset(
     {TensorProto.FLOAT, TensorProto.FLOAT16, TensorProto.INT8, TensorProto.UINT8, TensorProto.INT4, TensorProto.UINT4}
 )
 SINGLE_FILE_BYTES = 64_000_000
-"""A graph with more weights than this keeps them in a data file of their own, which is mapped and not read."""
+"""Bytes of weights above which a graph stores them in a separate data file, which is mapped instead of read."""
 
 
 def write_graph(
@@ -39,8 +39,8 @@ def write_graph(
 ) -> list[str]:
     """Write one graph and return the names of its files; same weights and precision → same bytes.
 
-    `half`: activations and KV buffers in fp16 (GPU targets). `ranges`: of the inputs of the encoder's layers, for its
-    plain int8 form. Raises ValueError for a name or form that is not known.
+    `half`: activations and KV buffers in fp16 (GPU targets). `ranges`: input ranges of the encoder's layers, for its
+    plain int8 form. Raises ValueError for an unknown name or form.
     """
     if form not in FORMS:
         raise ValueError(f"form {form!r} is not known; expected one of {FORMS}")
@@ -73,7 +73,7 @@ def _weight_bytes(module: nn.Module, precision: Precision) -> int:
 
 
 def graph_contract(path: Path) -> dict[str, list[dict[str, Any]]]:
-    """Inputs and outputs as the file declares them: name, dtype, shape (free axes by name)."""
+    """Read inputs and outputs from a graph file: name, dtype, shape (free axes by name)."""
     proto = onnx.load(str(path), load_external_data=False)
 
     def describe(value: onnx.ValueInfoProto) -> dict[str, Any]:
@@ -88,7 +88,7 @@ def graph_contract(path: Path) -> dict[str, list[dict[str, Any]]]:
 
 
 def graph_parameters(path: Path) -> int:
-    """Weights of the network that a graph file stores: packed ones one by one, without scales, tables and constants."""
+    """Count the network's weights in a graph file: packed ones individually, without scales, tables and constants."""
     proto = onnx.load(str(path), load_external_data=False)
     packed = {}
     for node in proto.graph.node:
@@ -103,7 +103,7 @@ def graph_parameters(path: Path) -> int:
 
 
 def linear_layers(config: TicVlaConfig, name: str) -> tuple[str, ...]:
-    """Names of the layers of a graph whose precision can be set one by one."""
+    """Return the names of a graph's layers whose precision can be set."""
     if name == "vision_encoder":
         blocks = [f"blocks.{i}.{part}" for i in range(config.vision.layers) for part in ("qkv", "proj", "fc1", "fc2")]
         stem = () if config.vision.stem_channels else ("embed",)
@@ -121,13 +121,13 @@ def linear_layers(config: TicVlaConfig, name: str) -> tuple[str, ...]:
         layers = [f"layers.{i}.{part}" for i in range(config.action.layers) for part in ("q", "o", "fc1", "fc2")]
         if config.action.head == "diffusion":
             return (*mlps, *pairs, *layers, "head.0", "head.2", "out", "diffusion.action_in")
-        # Layer 0 has no query product left: its queries are constants.
+        # Layer 0 has no query product: its queries are constants.
         trunk = (*mlps, *pairs, *(name for name in layers if name != "layers.0.q"), "head.0", "head.2")
         return (*trunk, *flow_layers(config)) if config.action.head == "flow" else (*trunk, "out")
     raise ValueError(f"graph {name!r} is not known")
 
 
 def flow_layers(config: TicVlaConfig) -> tuple[str, ...]:
-    """Names of a flow's own layers."""
+    """Return the names of a flow's layers."""
     parts = ("action_in", "key_value.k", "key_value.v", "layer.q", "layer.o", "layer.fc1", "layer.fc2", "out")
     return tuple(f"flow.couplings.{i}.{part}" for i in range(config.action.couplings) for part in parts)

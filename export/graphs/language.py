@@ -1,8 +1,8 @@
 """The language model's graphs: fused attention over the caller's KV buffers, which every call extends in place.
 
-`language_model` serves prefill and decode with one precision. The pair `language_model.prefill` (no vocabulary
-projection: it only fills the buffers) and `language_model.decode` (reads text only) serves them with two over the same
-buffers; the prompt's last token goes through decode, which gives the first new token.
+`language_model` computes prefill and decode in one precision. The pair `language_model.prefill` (fills the buffers,
+without vocabulary projection) and `language_model.decode` (reads text only) uses two precisions over the same buffers;
+decode reads the prompt's last token and returns the first new one.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from export.quantize.precision import PRECISIONS, Precision
 
 @dataclass(frozen=True)
 class Role:
-    """What a language graph is for."""
+    """Purpose of a language graph."""
 
     images: bool
-    """Takes visual tokens."""
+    """Whether it reads visual tokens."""
     token: bool
-    """Chooses the next token."""
+    """Whether it chooses the next token."""
 
 
 ROLES = {
@@ -36,13 +36,13 @@ ROLES = {
     "language_model.decode": Role(images=False, token=True),
 }
 EMBEDDING_FILE = "language_model.embed.{}.onnx.data"
-"""The token table, where it is large: both graphs of a pair read it, so it lies beside them once."""
+"""File of a large token table, which both graphs of a pair share."""
 CAPACITY = "C"
-"""Free axis of the KV buffers: their capacity, not the number of tokens in them."""
+"""Free axis of the KV buffers: their capacity, not the number of stored tokens."""
 
 
 def cache_names(layers: int, prefix: str) -> list[str]:
-    """KV buffers, `past_key_values.0.key` style (the convention of ONNX Runtime's generative tools)."""
+    """Return the KV buffers' names, such as `past_key_values.0.key` (convention of ONNX Runtime's generative tools)."""
     return [f"{prefix}.{i}.{part}" for i in range(layers) for part in ("key", "value")]
 
 
@@ -57,7 +57,7 @@ def write_language(
     half: bool,
     external: bool,
 ) -> list[str]:
-    """Write one language graph; visual tokens come as [F, tokens, token_dim]."""
+    """Write one language graph; visual tokens are [F, tokens, token_dim]."""
     c, role = language.config, ROLES[name]
     with GraphWriter(directory, name, precision=precision, form="fused", half=half, external=external) as g:
         ids = g.input("input_ids", TensorProto.INT64, (1, "S"))
@@ -83,14 +83,14 @@ def write_language(
 
 
 def rope_tables(theta: float, head_dim: int, positions: int) -> tuple[Array, Array]:
-    """Cosines and sines [positions, head_dim/2] of the rotary embedding, as float32 (computed as the network does)."""
+    """Compute cosines and sines [positions, head_dim/2] of the rotary embedding in float32, as the network does."""
     inverse = np.float32(theta) ** (-np.arange(0, head_dim, 2, dtype=np.float32) / np.float32(head_dim))
     angle = np.arange(positions, dtype=np.float32)[:, None] * inverse[None]
     return np.cos(angle).astype(np.float32), np.sin(angle).astype(np.float32)
 
 
 class _Position:
-    """Where a call's tokens stand: everything about it that all layers share."""
+    """Positions of a call's tokens, shared by all layers."""
 
     def __init__(self, g: GraphWriter, ids: str, tables: tuple[Array, Array]) -> None:
         self.seqlens = g.input("seqlens_k", TensorProto.INT32, (1,))
@@ -102,7 +102,7 @@ class _Position:
 
 
 def _embedding(g: GraphWriter, language: LanguageModel, ids: str) -> str:
-    """Rows of the token table [1, S, hidden]; stored in 16 or 8 bits, computed in the graph's float type."""
+    """Write the lookup of token embeddings [1, S, hidden]; stored in 16 or 8 bits, computed in the graph's type."""
     table, precision = array(language.embed.weight), g.precision.of("embed")
     if precision in ("fp32", "fp16"):
         stored = table.astype(np.float16 if precision == "fp16" else np.float32)
@@ -122,7 +122,7 @@ def _embedding(g: GraphWriter, language: LanguageModel, ids: str) -> str:
 
 
 def _insert_images(g: GraphWriter, language: LanguageModel, ids: str, text: str, tokens: int, token_dim: int) -> str:
-    """Visual tokens in the places of `<IMG_CONTEXT>`, in order, after the `image_offset` that earlier calls took."""
+    """Replace `<IMG_CONTEXT>` by visual tokens in order, from `image_offset` on (the number used by earlier calls)."""
     c = language.config
     visual = g.input("visual_tokens", TensorProto.FLOAT, ("F", tokens, token_dim))
     offset = g.input("image_offset", TensorProto.INT64, (1,))
@@ -138,7 +138,7 @@ def _insert_images(g: GraphWriter, language: LanguageModel, ids: str, text: str,
     is_image = g.op("Equal", [ids, g.constant([[c.img_context_id]])])
     count = g.op("CumSum", [g.cast(is_image, TensorProto.INT64), g.constant(1)])
     place = g.op("Add", [g.op("Sub", [count, g.constant([1])]), offset])
-    # A text position's place is not used; more image places than image tokens cannot come from our prompt builder.
+    # The index at a text position is unused. The prompt builder never makes more image positions than image tokens.
     last = g.op("Sub", [g.op("Shape", [images], start=0, end=1), g.constant([1])])
     place = g.op("Min", [g.op("Max", [place, g.constant([0])]), last])
     rows = g.op("Gather", [images, place])
@@ -146,7 +146,7 @@ def _insert_images(g: GraphWriter, language: LanguageModel, ids: str, text: str,
 
 
 def _norm(g: GraphWriter, x: str, delta: str | None, weight: str, eps: float) -> tuple[str, str]:
-    """RMS norm of x + delta, and that sum."""
+    """Write the RMS norm of x + delta; returns it and the sum."""
     if delta is None:
         return g.op("SimplifiedLayerNormalization", [x, weight], axis=-1, epsilon=eps, stash_type=1), x
     outputs = [g.unique("normed"), "", "", g.unique("residual")]
@@ -165,13 +165,13 @@ def _layer(
     past_value: str,
     position: _Position,
 ) -> tuple[str, str]:
-    """One decoder layer; returns the residual and what is still to be added to it (the next norm adds it)."""
+    """Write one decoder layer; returns the residual and the summand that the next norm adds to it."""
     c, name = layer.config, f"layers.{index}"
     gain = g.floats(array(layer.input_norm.weight), f"{name}.input_norm")
     h, x = _norm(g, x, delta, gain, c.rms_eps)
     weight = np.concatenate([array(m.weight) for m in (layer.q, layer.k, layer.v)])
     bias = np.concatenate([array(m.bias) for m in (layer.q, layer.k, layer.v)])
-    # One product for queries, keys and values, as exact as the most exact of the three.
+    # One product for queries, keys and values, in the most exact precision of the three.
     exact = min((g.precision.of(f"{name}.{part}") for part in "qkv"), key=PRECISIONS.index)
     qkv = g.linear(h, f"{name}.qkv", weight, bias, precision=exact)
     attended, _, _ = g.ops(
@@ -196,7 +196,7 @@ def _layer(
 
 
 def _last_layer_kv(g: GraphWriter, last: int, position: _Position, width: int) -> None:
-    """The new tokens' keys and values of the last layer, cut out of its buffers: [1, S, kv_dim]."""
+    """Slice the new tokens' keys and values [1, S, kv_dim] from the last layer's buffers."""
     parts = []
     for part in ("key", "value"):
         new = g.op("Slice", [f"present.{last}.{part}", position.begin, position.end, g.constant([2])])
@@ -205,7 +205,7 @@ def _last_layer_kv(g: GraphWriter, last: int, position: _Position, width: int) -
 
 
 def _next_token(g: GraphWriter, language: LanguageModel, x: str, delta: str) -> None:
-    """Greedy choice after the last position; only that position meets the vocabulary."""
+    """Write the greedy choice; only the last position is projected onto the vocabulary."""
     c = language.config
     last = [
         g.op("Slice", [t, g.constant([-1]), g.constant([np.iinfo(np.int64).max]), g.constant([1])]) for t in (x, delta)

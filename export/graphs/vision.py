@@ -14,7 +14,7 @@ from export.quantize.precision import Precision
 
 
 def array(tensor: Tensor) -> Array:
-    """A weight as float32 numpy, without a copy where torch allows."""
+    """Return a weight as a float32 numpy array, without a copy if possible."""
     value: Array = tensor.detach().float().numpy()
     return value
 
@@ -50,7 +50,7 @@ def write_vision(
 
 
 def _patches(g: GraphWriter, vision: VisionEncoder, frame: str) -> str:
-    """Patch embedding as one product over whole patches; mean and deviation are part of its weights."""
+    """Write the patch embedding as one product over whole patches, with mean and deviation folded into its weights."""
     c = vision.config
     assert isinstance(vision.embed, nn.Conv2d) and vision.embed.bias is not None
     weight, bias = array(vision.embed.weight), array(vision.embed.bias)
@@ -65,9 +65,9 @@ def _patches(g: GraphWriter, vision: VisionEncoder, frame: str) -> str:
 
 
 def _stem(g: GraphWriter, vision: VisionEncoder, frame: str) -> str:
-    """Stride-2 convolutions; only the deviation folds into them, because their padding is at the mean colour."""
+    """Write stride-2 convolutions; only the deviation folds into them, because their padding has the mean colour."""
     c = vision.config
-    # As exact as the graph's default, like the products: no override names a convolution.
+    # Convolutions have the graph's default precision: no override names one.
     exact = g.precision.default == "fp32"
     kind = np.dtype(np.float32) if exact else g.float
     bits = "fp16" if g.precision.default == "fp16" or (g.half and not exact) else "fp32"
@@ -92,19 +92,19 @@ def _stem(g: GraphWriter, vision: VisionEncoder, frame: str) -> str:
 
 
 def layer_norm(g: GraphWriter, x: str, module: nn.LayerNorm, name: str) -> str:
-    """LayerNormalization over the last axis."""
+    """Write a LayerNormalization over the last axis."""
     scale, shift = g.floats(array(module.weight), f"{name}.weight"), g.floats(array(module.bias), f"{name}.bias")
     return g.op("LayerNormalization", [x, scale, shift], axis=-1, epsilon=module.eps)
 
 
 def split_heads(g: GraphWriter, x: str, heads: int, *, keys: bool = False, out: str | None = None) -> str:
-    """[1, T, heads·d] → [1, heads, T, d], or [1, heads, d, T] for keys that are multiplied from the right."""
+    """Write [1, T, heads·d] → [1, heads, T, d], or [1, heads, d, T] for keys."""
     x = g.op("Reshape", [x, g.constant([0, 0, heads, -1])])
     return g.op("Transpose", [x], perm=[0, 2, 3, 1] if keys else [0, 2, 1, 3], out=out)
 
 
 def merge_heads(g: GraphWriter, x: str) -> str:
-    """[1, heads, T, d] → [1, T, heads·d]."""
+    """Write [1, heads, T, d] → [1, T, heads·d]."""
     return g.op("Reshape", [g.op("Transpose", [x], perm=[0, 2, 1, 3]), g.constant([0, 0, -1])])
 
 
@@ -116,7 +116,7 @@ def _block(g: GraphWriter, x: str, name: str, block: VisionBlock, eps: float) ->
     parts = []
     for part in range(3):
         rows = slice(part * hidden, (part + 1) * hidden)
-        # The softmax's scale is part of the query's weights: exact for a power of two, and one pass less.
+        # The query's weights include the softmax's scale: exact for a power of two, and saves a pass.
         factor = scale if part == 0 else np.float32(1)
         part_name = f"{name}.{'qkv'[part]}"
         parts.append(g.linear(h, part_name, weight[rows] * factor, bias[rows] * factor, of=f"{name}.qkv"))
@@ -141,7 +141,7 @@ def _block(g: GraphWriter, x: str, name: str, block: VisionBlock, eps: float) ->
 
 
 def fold_tokens(g: GraphWriter, x: str, grid: int, side: int, width: int) -> str:
-    """Pixel shuffle of tokens [n, grid², width] → [n, (grid/side)², side²·width] in InternVL's `v2` order."""
+    """Write the pixel shuffle [n, grid², width] → [n, (grid/side)², side²·width] in InternVL's `v2` order."""
     if side == 1:
         return x
     small = grid // side

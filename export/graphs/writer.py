@@ -1,4 +1,4 @@
-"""Writes one ONNX graph node by node, its large weights straight to an external-data file."""
+"""Writes one ONNX graph node by node, and large weights directly to an external-data file."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from export.quantize.rounding import quantise_blocks, quantise_channels
 Array = npt.NDArray[Any]
 Constant = Array | np.generic | Sequence[int] | Sequence[Sequence[int]] | int
 Ranges = Mapping[str, float]
-"""Largest magnitude that calibration met at a layer's input, by layer name."""
+"""Layer name → largest magnitude at its input during calibration."""
 
 OPSET = 20
 IR_VERSION = 10
 CONTRIB = "com.microsoft"
 PRODUCER = "tic-vla-edge"
 EXTERNAL_BYTES = 4096
-"""Weights of at least this size go to the data file, if the graph has one."""
+"""Smallest size of a weight in the data file, bytes."""
 ALIGNMENT = 4096
 """Offsets in the data file are multiples of a page, so that ONNX Runtime can map weights instead of reading them."""
 INT8_COMPUTE = 4
@@ -33,7 +33,7 @@ INT8_COMPUTE = 4
 
 
 class GraphWriter:
-    """A graph under construction; as a context manager it leaves NAME.onnx (and NAME.onnx.data) or nothing."""
+    """Graph under construction; the context manager writes NAME.onnx (and NAME.onnx.data), or nothing on an error."""
 
     def __init__(
         self,
@@ -86,19 +86,19 @@ class GraphWriter:
         return name
 
     def output(self, name: str, dtype: int, shape: Sequence[int | str]) -> None:
-        """Declare a value that was computed under that name as a graph output."""
+        """Declare an existing value as a graph output."""
         self._outputs.append(helper.make_tensor_value_info(name, dtype, list(shape)))
 
     def op(
         self, kind: str, inputs: Sequence[str], *, out: str | None = None, contrib: bool = False, **attr: Any
     ) -> str:
-        """Append a node with one output and return the output's name (`out`, or one derived from the node)."""
+        """Append a node with one output; returns the output's name (`out`, or one derived from the node)."""
         return self.ops(kind, inputs, [out or self.unique(kind)], contrib=contrib, **attr)[0]
 
     def ops(
         self, kind: str, inputs: Sequence[str], outputs: Sequence[str], *, contrib: bool = False, **attr: Any
     ) -> list[str]:
-        """Append a node with the named outputs ("" for one that is not wanted)."""
+        """Append a node with named outputs ("" for an unused one)."""
         self._names.update(outputs)
         self._nodes.append(
             helper.make_node(
@@ -113,7 +113,7 @@ class GraphWriter:
         return list(outputs)
 
     def unique(self, stem: str) -> str:
-        """A value name that is not taken."""
+        """Return an unused value name."""
         name, n = stem, 1
         while name in self._names:
             name, n = f"{stem}_{n}", n + 1
@@ -121,7 +121,7 @@ class GraphWriter:
         return name
 
     def constant(self, value: Constant, stem: str = "c") -> str:
-        """A small constant (int64 for Python integers); equal ones are stored once."""
+        """Add a small constant (int64 for Python integers); equal ones are stored once."""
         array = np.asarray(value)
         if array.dtype.kind == "i" and not isinstance(value, np.ndarray):
             array = array.astype(np.int64)
@@ -131,18 +131,18 @@ class GraphWriter:
         return self._shared[key]
 
     def floats(self, value: Array | np.generic, stem: str = "f") -> str:
-        """A small constant in the graph's float type."""
+        """Add a small constant in the graph's float type."""
         return self.constant(np.asarray(value).astype(self.float), stem)
 
     def weight(self, value: Array, name: str) -> str:
-        """A weight under its own name, in its own type; it goes to the data file when it is large.
+        """Add a weight under its name and in its type; a large one goes to the data file.
 
-        A layer that is gone through again, as in an unrolled loop, gives the same weight again: it is stored once.
+        A layer of an unrolled loop adds the same weight in every pass; it is stored once.
         """
         stored = self._weights.get(name)
         if stored is not None:
             if stored.raw_data != np.ascontiguousarray(value).tobytes():
-                raise ValueError(f"{self.name}: two weights have the name {name}")
+                raise ValueError(f"{self.name}: two different weights have the name {name}")
             return name
         self._names.add(name)
         self._store(value, name)
@@ -150,7 +150,7 @@ class GraphWriter:
         return name
 
     def shared_weight(self, value: Array, name: str, file: str) -> str:
-        """A weight in a data file of its own, which several graphs name and each of them writes alike."""
+        """Add a weight in a separate data file, which several graphs share and each writes identically."""
         if self._data_path is None:
             return self.weight(value, name)
         self._names.add(name)
@@ -188,9 +188,9 @@ class GraphWriter:
         of: str | None = None,
         precision: str | None = None,
     ) -> str:
-        """x [..., in] · weight [out, in]ᵀ + bias in the precision that the graph gives this layer.
+        """Write x [..., in] · weight [out, in]ᵀ + bias in the layer's precision.
 
-        `of`: the network's layer that this is a part of, by whose name precision and range are looked up.
+        `of`: name of the network's layer that this product is a part of; it determines precision and range.
         """
         precision = precision or self.precision.of(of or layer)
         if block_size(precision) is not None:
@@ -215,7 +215,7 @@ class GraphWriter:
         return y if bias is None else self.op("Add", [y, self.floats(bias, f"{layer}.bias")])
 
     def in_float32(self, x: str) -> str:
-        """x, which is in the graph's float type, in fp32."""
+        """Cast x from the graph's float type to fp32."""
         return self.cast(x, TensorProto.FLOAT) if self.half else x
 
     def from_float32(self, x: str) -> str:
@@ -223,9 +223,9 @@ class GraphWriter:
         return self.cast(x, self.float_type) if self.half else x
 
     def stored(self, value: Array, name: str, precision: str) -> str:
-        """A weight stored in 16 or 32 bits, as its product reads it.
+        """Add a weight stored in 16 or 32 bits.
 
-        16 bits are widened where activations have 32: by a runtime once when it opens the graph, to the same numbers.
+        If activations have 32 bits, the runtime widens 16-bit weights once when it opens the graph; values stay equal.
         """
         if precision == "fp32":
             return self.weight(value.astype(np.float32), name)
@@ -233,11 +233,11 @@ class GraphWriter:
         return half if self.half else self.cast(half, TensorProto.FLOAT)
 
     def _static_int8(self, x: str, layer: str, weight: Array, bias: Array | None, largest: float | None) -> str:
-        """Quantise-dequantise around a product, in the one form that compilers turn into 8-bit kernels.
+        """Quantise and dequantise around a product, in the form that compilers turn into 8-bit kernels.
 
-        Input: one symmetric range a tensor, from calibration, rounded once for all layers that read it. Weights: 8 bits
-        a channel. Nothing around attention or additions: quantising those too is what made it slower, not faster.
-        Without a range only the weights are rounded.
+        Input: one symmetric range per tensor from calibration, rounded once for all layers that read it. Weights: 8
+        bits per channel. Attention and additions are not quantised, because that made the graph slower. Without a range
+        only the weights are rounded.
         """
         q = quantise_channels(weight)
         stored = [self.weight(q.values.T, f"{layer}.weight"), self.floats(q.scales, f"{layer}.scale")]
@@ -259,7 +259,7 @@ class GraphWriter:
         scales = q.scales.astype(self.float)
         inputs = [x, self.weight(q.packed, f"{layer}.weight"), self.weight(scales, f"{layer}.scale")]
         if bias is not None and not self.half:
-            # The CUDA kernel for one row has no fused bias; there it stays an addition of its own.
+            # The CUDA kernel for one row has no fused bias: add the bias in a separate node.
             inputs += ["", "", self.weight(bias.astype(np.float32), f"{layer}.bias")]
         y = self.op(
             "MatMulNBits",
@@ -274,11 +274,11 @@ class GraphWriter:
         return self.op("Add", [y, self.floats(bias, f"{layer}.bias")]) if bias is not None and self.half else y
 
     def cast(self, x: str, dtype: int, *, out: str | None = None) -> str:
-        """x in another element type."""
+        """Cast x to another element type."""
         return self.op("Cast", [x], out=out, to=dtype)
 
     def to_float32(self, x: str, out: str) -> str:
-        """x under the name of a float32 output of the graph."""
+        """Cast x to a float32 output of the graph."""
         return self.cast(x, TensorProto.FLOAT, out=out) if self.half else self.op("Identity", [x], out=out)
 
     def finish(self) -> list[str]:

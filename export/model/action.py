@@ -1,13 +1,13 @@
-"""Action expert: learned queries that cross-attend to now (frame, state) and to a delayed semantic state (Fig. 3a).
+"""Action expert: learned queries cross-attend to the present (frame, state) and a delayed semantic state (Fig. 3a).
 
-Split in two so that the part which depends on the semantic state alone runs once a generation: `SemanticContext`
-projects the VLM's tokens to every layer's keys and values, `ActionExpert` adds what changes each tick. Keys and
-values are per-token linear maps, so the split is exact. Waypoints are re-expressed in the robot's current frame first
-(paper appendix C), so their context, of three tokens, is computed every tick.
+The part that depends on the semantic state alone runs once a generation: it projects the VLM's tokens to every layer's
+keys and values. The rest runs in every tick. Keys and values are linear maps of each token, so the split is exact.
+Waypoints are first transformed to the robot's current frame (paper appendix C), so their context of three tokens is
+computed in every tick.
 
-What becomes of the queries is the head's business: `query` reads the actions off them; `diffusion` and `flow` are in
-`export.model.heads`. A diffusion's layers also attend to the chunk's own tokens, with the keys and values that the
-present goes through: cross-attention alone would denoise every step without knowing of its neighbours.
+The head turns the queries into actions: `query` reads the actions directly; `diffusion` and `flow` are in
+`export.model.heads`. A diffusion's layers also attend to the chunk's tokens, with the projections of the present:
+otherwise each step would be denoised without its neighbours.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from export.model.heads import ActionScale, Diffusion, Flow, differentiated, dra
 
 
 class TrunkLayers(Protocol):
-    """The cross-attention layers over B instants, however their keys and values are kept."""
+    """Interface of the cross-attention layers over B instants."""
 
     @property
     def batch(self) -> int: ...
@@ -35,15 +35,15 @@ class TrunkLayers(Protocol):
 
 @dataclass(frozen=True)
 class Trunk:
-    """The cross-attention layers over what an expert knows at B instants: keys and values are made once for all."""
+    """Cross-attention layers with the keys and values of B instants, computed once for all passes."""
 
     layers: tuple[CrossAttentionLayer, ...]
     key_values: tuple[KeyValue, ...]
     keys: tuple[Tensor, ...]
-    """Of each layer, present before semantics: [B, heads, N + 2 + T, d]."""
+    """Keys and values of each layer, present before semantics: [B, heads, N + 2 + T, d]."""
     values: tuple[Tensor, ...]
     mask: Tensor | None
-    """[B, 1, 1, N + 2 + T] bool, False at padding; None: nothing is padding."""
+    """[B, 1, 1, N + 2 + T] bool, False at padding; None without padding."""
 
     @property
     def batch(self) -> int:
@@ -51,7 +51,7 @@ class Trunk:
         return len(self.keys[0])
 
     def __call__(self, x: Tensor, *, among: bool = False) -> Tensor:
-        """Tokens [B, S, hidden] through all layers; `among`: they also attend to one another."""
+        """Pass tokens [B, S, hidden] through all layers; with `among` they also attend to one another."""
         mask = self.mask
         if among and mask is not None:
             mask = torch.cat([mask, mask.new_ones(*mask.shape[:-1], x.shape[1])], dim=-1)
@@ -89,7 +89,7 @@ class ActionExpert(nn.Module):
             self.out = nn.Linear(c.hidden, 3)
 
     def start(self, generator: torch.Generator) -> None:
-        """Begin near a slow walk straight ahead, as policies usually start at their mean; fill the head's buffers."""
+        """Initialise the output near a slow walk straight ahead, and fill the head's buffers."""
         with torch.no_grad():
             if self.scale is None:
                 self.out.bias.copy_(torch.tensor(self.config.action.initial_step))
@@ -101,18 +101,18 @@ class ActionExpert(nn.Module):
                 self.flow.start()
 
     def fit_actions(self, trajectories: Tensor, known: Tensor | None = None) -> None:
-        """Normalise actions by a data set's trajectories [N, steps, 3], of which `known` [N, steps].
+        """Fit the action scale to a data set's trajectories [N, steps, 3], valid where `known` [N, steps].
 
-        The query head takes actions as they are, and nothing happens. Raises ValueError for a step that is never known.
+        No effect for the query head, which has no scale. Raises ValueError if a step is never valid.
         """
         if self.scale is not None:
             self.scale.fit(differentiated(trajectories, self.config.action.parameterisation), known)
 
     def semantic_tokens(self, guidance: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Last-layer K‖V [B, T, kv_dim], or waypoints [B, 3, 2] in m in the current robot frame → [B, T, hidden].
+        """Project last-layer K‖V [B, T, kv_dim] or waypoints [B, 3, 2] (m, current robot frame) to [B, T, hidden].
 
-        States of different lengths are padded on the left: a token's place is counted from the end, where the answer's
-        last line, the waypoints, always stands. In training, `generator` (else torch's own) draws what is dropped out.
+        States of different lengths are padded on the left: positions count from the end, so the answer's last line, the
+        waypoints, always has the same positions. In training, `generator` (else torch's own) draws the dropout.
         """
         interface = self.config.action.semantic_interface
         if interface == "values-only":
@@ -120,24 +120,24 @@ class ActionExpert(nn.Module):
         places = self.semantic_position[:, self.semantic_position.shape[1] - guidance.shape[1] :]
         tokens: Tensor = self.semantic_projection(guidance) + places
         if self.training and interface != "waypoints":
-            # Whole K‖V tokens are dropped (paper: token dropout 0.1), so that missing semantics are survivable.
+            # Drop whole K‖V tokens (paper: token dropout 0.1), so that the expert tolerates missing semantics.
             chance = drawn(torch.rand, tuple(tokens.shape[:2]), tokens.device, generator)
             tokens = tokens * (chance >= self.config.action.kv_dropout)[..., None]
         return tokens
 
     def context(self, guidance: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
-        """Semantic context: keys and values [layers, B, heads, T, hidden/heads] of the semantic tokens."""
+        """Compute the semantic context: keys and values [layers, B, heads, T, hidden/heads] of the semantic tokens."""
         return self.context_of(self.semantic_tokens(guidance, generator))
 
     def context_of(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
-        """Keys and values [layers, B, heads, T, hidden/heads] of semantic tokens [B, T, hidden]."""
+        """Compute keys and values [layers, B, heads, T, hidden/heads] of semantic tokens [B, T, hidden]."""
         pairs = [kv(tokens) for kv in self.key_values]
         return torch.stack([k for k, _ in pairs]), torch.stack([v for _, v in pairs])
 
     def now_tokens(
         self, visual_tokens: Tensor, state: Tensor, latency: Tensor, generator: torch.Generator | None = None
     ) -> Tensor:
-        """Tokens of the present [B, N + 2, hidden]: frame, robot state (vx, vy, ωz), latency (Δt, Δx, Δy, Δθ)."""
+        """Compute tokens of the present [B, N + 2, hidden]: frame, state (vx, vy, ωz), latency (Δt, Δx, Δy, Δθ)."""
         c = self.config.action
         visual = self.visual_projection(visual_tokens) + self.visual_position
         if not c.latency_aware:
@@ -154,9 +154,9 @@ class ActionExpert(nn.Module):
     def trunk(
         self, now: Tensor, context_keys: Tensor, context_values: Tensor, context_mask: Tensor | None = None
     ) -> Trunk:
-        """The layers over the present [B, N + 2, hidden] and a semantic context of B, or of S that share it evenly.
+        """Build the layers over the present [B, N + 2, hidden] and the semantic context of S states, S a divisor of B.
 
-        B/S instants in a row act on one semantic state. `context_mask` [S, T] is False at padding.
+        B/S consecutive instants use the same semantic state. `context_mask` [S, T] is False at padding.
         """
         keys, values = [], []
         share = len(now) // context_keys.shape[1]
@@ -180,12 +180,12 @@ class ActionExpert(nn.Module):
         context_mask: Tensor | None = None,
         generator: torch.Generator | None = None,
     ) -> Tensor:
-        """Planned trajectory [B, steps, 3] (x m, y m, θ rad) in the current robot frame."""
+        """Plan a trajectory [B, steps, 3] (x m, y m, θ rad) in the current robot frame."""
         now = self.now_tokens(visual_tokens, state, latency, generator)
         return self.plan(self.trunk(now, context_keys, context_values, context_mask))
 
     def plan(self, trunk: TrunkLayers) -> Tensor:
-        """The trajectory [B, steps, 3] from what the layers see; of a distribution, the point that `heads` explains."""
+        """Plan a trajectory [B, steps, 3]; a generative head returns the point that `heads` explains."""
         if self.scale is None:
             actions = self.out(self._features(trunk))
         elif self.flow is not None:
@@ -197,7 +197,7 @@ class ActionExpert(nn.Module):
         return integrated(actions, self.config.action.parameterisation)
 
     def errors(self, trunk: TrunkLayers, target: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """What training makes small, number by number [B, steps, 3], for driven trajectories `target` [B, steps, 3].
+        """Return the loss per number [B, steps, 3] for driven trajectories `target` [B, steps, 3].
 
         query: smooth L1 of the integrated poses (equation 4); diffusion: squared error of the clean normalised actions
         at a noise level drawn by `generator`; flow: −log p of the normalised actions. Raises ValueError.
@@ -218,12 +218,12 @@ class ActionExpert(nn.Module):
         return (self._denoised(noisy, times, trunk).float() - actions).square()
 
     def _features(self, trunk: TrunkLayers) -> Tensor:
-        """What each step's query found [B, steps, hidden]."""
+        """Return the features of each step's query [B, steps, hidden]."""
         features: Tensor = self.head(self.norm(trunk(self.queries.expand(trunk.batch, -1, -1))))
         return features
 
     def _denoised(self, noisy: Tensor, times: Tensor, trunk: TrunkLayers) -> Tensor:
-        """Clean normalised actions [B, steps, 3] as predicted from noisy ones at levels [B]."""
+        """Predict clean normalised actions [B, steps, 3] from noisy ones at levels [B]."""
         assert self.diffusion is not None
         tokens = self.diffusion.tokens(noisy, times, self.queries)
         clean: Tensor = self.out(self.head(self.norm(trunk(tokens, among=True))))
@@ -231,5 +231,5 @@ class ActionExpert(nn.Module):
 
 
 def _shared(tensor: Tensor, share: int) -> Tensor:
-    """Every row for `share` instants in a row."""
+    """Repeat every row for `share` consecutive instants."""
     return tensor if share == 1 else tensor.repeat_interleave(share, dim=0)

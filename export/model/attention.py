@@ -1,4 +1,4 @@
-"""What the network is built of: typed module lists, projections into the latent space and cross-attention layers."""
+"""Building blocks of the network: typed module lists, projections into the latent space, cross-attention layers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ M = TypeVar("M", bound=nn.Module)
 
 
 class TypedModuleList(nn.ModuleList, Generic[M]):
-    """`nn.ModuleList` that knows the type of its entries; at run time it is that list, parameter names included."""
+    """`nn.ModuleList` with a type for its entries; parameter names stay the same."""
 
     if TYPE_CHECKING:
 
@@ -30,7 +30,7 @@ class TypedModuleList(nn.ModuleList, Generic[M]):
 
 
 def projection(inputs: int, hidden: int) -> nn.Sequential:
-    """Two-layer MLP into the shared latent space (paper appendix A: "projected … via MLP layers")."""
+    """Create a two-layer MLP into the shared latent space (paper appendix A: "projected … via MLP layers")."""
     return nn.Sequential(nn.Linear(inputs, hidden), nn.GELU(), nn.Linear(hidden, hidden))
 
 
@@ -44,7 +44,7 @@ class KeyValue(nn.Module):
         self.v = nn.Linear(hidden, hidden)
 
     def forward(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
-        """Tokens [B, T, hidden] → keys and values [B, heads, T, hidden/heads]."""
+        """Project tokens [B, T, hidden] to keys and values [B, heads, T, hidden/heads]."""
         n, t, d = tokens.shape
         split = (n, t, self.heads, d // self.heads)
         return self.k(tokens).reshape(split).transpose(1, 2), self.v(tokens).reshape(split).transpose(1, 2)
@@ -64,7 +64,10 @@ class CrossAttentionLayer(nn.Module):
         self.fc2 = nn.Linear(ffn, hidden)
 
     def forward(self, x: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None = None) -> Tensor:
-        """Queries [B, S, hidden] over keys and values [B, heads, T, d]; `mask` [B, 1, 1, T] is False at padding."""
+        """Attend from queries [B, S, hidden] to keys and values [B, heads, T, d].
+
+        `mask` [B, 1, 1, T] is False at padding.
+        """
         n, t, d = x.shape
         q = self.q(self.norm1(x)).reshape(n, t, self.heads, d // self.heads).transpose(1, 2)
         attended = F.scaled_dot_product_attention(q, keys, values, attn_mask=mask)

@@ -16,19 +16,19 @@ from edge.state.reasoning_text import WAYPOINT_TIMES_S
 from export.core.typed import FieldError, SettingText, build, field_types, near
 
 SEMANTIC_INTERFACES = ("kv", "values-only", "waypoints")
-"""What of a generation reaches the action expert: last-layer K‖V, V alone, or the points it wrote (paper Table 2)."""
+"""Part of a generation that the action expert receives: last-layer K‖V, V alone, or waypoints (paper Table 2)."""
 PARAMETERISATIONS = ("increments", "offsets")
 HEADS = ("query", "diffusion", "flow")
-"""How the actions are made (paper Table 11): read off the queries, denoised, or mapped from a Gaussian."""
+"""Heads of the action expert (paper Table 11): read from the queries, denoised, or mapped from a Gaussian."""
 OF_HEADS = ("head", "diffusion_steps", "ddim_steps", "couplings")
-"""Numbers of an action expert that came with the heads."""
+"""Fields of the action expert that only generative heads use; older files lack them."""
 MODEL_PREFIX = "model."
-"""Of a `--set` that changes the network and not the target."""
+"""Prefix of a `--set` that changes the network instead of the target."""
 MAX_CONFIG_BYTES = 1 << 20
 
 
 class ModelConfigError(ValueError):
-    """A model configuration that contradicts itself."""
+    """Invalid model configuration."""
 
 
 def _require(ok: bool, message: str) -> None:
@@ -37,7 +37,7 @@ def _require(ok: bool, message: str) -> None:
 
 
 def _require_sizes(config: object) -> None:
-    """Sizes and counts lie between 1 and 2^20: more would not be a network for a robot but a mistyped number."""
+    """Check that sizes and counts are 1 to 2^20: a larger one is a typing error."""
     for key, value in vars(config).items():
         for size in value if isinstance(value, tuple) else (value,):
             if isinstance(size, int) and not isinstance(size, bool) and not key.endswith("_id"):
@@ -102,7 +102,7 @@ class LanguageConfig:
     rope_theta: float = 1e6
     rms_eps: float = 1e-6
     token_merge: int = 1
-    """Side of the square of visual tokens merged into one language token (1: none, as in the paper)."""
+    """Side of the square of visual tokens that are merged into one language token (1: no merging, as in the paper)."""
     max_context: int = 1536
     im_start_id: int = 151644
     im_end_id: int = 151645
@@ -138,12 +138,12 @@ class ActionConfig:
     motion_offset: bool = True
     parameterisation: str = "increments"
     initial_step: tuple[float, float, float] = (0.05, 0.0, 0.0)
-    """(dx m, dy m, dθ rad) a step that the head's bias starts from: 0.5 m/s straight ahead."""
+    """Initial bias of the head per step (dx m, dy m, dθ rad): 0.5 m/s straight ahead."""
     head: str = "query"
     diffusion_steps: int = 100
-    """Noise levels that a diffusion is trained on."""
+    """Noise levels of a diffusion in training."""
     ddim_steps: int = 5
-    """Of them at inference, each a pass through all layers."""
+    """Noise levels at inference, each a pass through all layers."""
     couplings: int = 5
     """Affine couplings of a flow."""
 
@@ -203,7 +203,7 @@ class TicVlaConfig:
 
     @property
     def frame_tokens(self) -> int:
-        """Language tokens that one frame takes."""
+        """Language tokens of one frame."""
         return self.vision.tokens // self.language.token_merge**2
 
     @property
@@ -213,18 +213,18 @@ class TicVlaConfig:
 
     @property
     def guidance_width(self) -> int:
-        """Width of one token of what the semantic context is made from."""
+        """Width of one input token of the semantic context."""
         widths = {"kv": self.kv_dim, "values-only": self.kv_dim // 2, "waypoints": 2}
         return widths[self.action.semantic_interface]
 
     @property
     def guidance_tokens(self) -> int:
-        """Most tokens that the semantic context is made from."""
+        """Largest number of input tokens of the semantic context."""
         by_text = self.action.semantic_interface == "waypoints"
         return len(WAYPOINT_TIMES_S) if by_text else self.language.max_context
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON form; a query head's is without what only other heads have, as it was before there were any."""
+        """Return the plain JSON form; a query head omits the other heads' fields, so that old files stay equal."""
         content = dataclasses.asdict(self)
         if self.action.head == "query":
             usual, action = ActionConfig(), content["action"]
@@ -273,7 +273,7 @@ PRESETS = {
 
 
 def config_for(model: str) -> TicVlaConfig:
-    """The configuration that `--model` names: a preset or a `.json` file; raises ModelConfigError."""
+    """Load the configuration that `--model` names: a preset or a `.json` file. Raises ModelConfigError."""
     if model in PRESETS:
         return PRESETS[model]
     if model.endswith(".json"):
@@ -299,7 +299,7 @@ def config_from_file(path: Path) -> TicVlaConfig:
 
 
 def config_from_dict(content: object, where: str = "model") -> TicVlaConfig:
-    """The inverse of `TicVlaConfig.to_dict`; raises ModelConfigError on unknown keys and values of another type."""
+    """Build a configuration from its `to_dict` form. Raises ModelConfigError for unknown keys and wrong types."""
     try:
         return build(TicVlaConfig, content, where)
     except FieldError as error:
@@ -307,7 +307,7 @@ def config_from_dict(content: object, where: str = "model") -> TicVlaConfig:
 
 
 def model_settings(settings: Sequence[str]) -> dict[str, str]:
-    """Numbers of the network by `section.field`, from `--set model.section.field=value`; others are left out."""
+    """Return `section.field` → value of each `--set model.section.field=value`; ignores other settings."""
     pairs = [setting.partition("=") for setting in settings]
     return {
         key.strip().removeprefix(MODEL_PREFIX): value for key, _, value in pairs if key.strip().startswith(MODEL_PREFIX)
@@ -315,7 +315,7 @@ def model_settings(settings: Sequence[str]) -> dict[str, str]:
 
 
 def with_overrides(config: TicVlaConfig, overrides: Mapping[str, str]) -> TicVlaConfig:
-    """`config` with fields such as `action.layers` replaced by values written as text; raises ModelConfigError."""
+    """Replace fields such as `action.layers` by values given as text. Raises ModelConfigError."""
     content = config.to_dict()
     sections = {key: kind for key, kind in field_types(TicVlaConfig).items() if key != "name"}
     names = [f"{section}.{key}" for section, cls in sections.items() for key in field_types(cls)]

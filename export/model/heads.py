@@ -1,14 +1,14 @@
-"""The two other ways to make a chunk of actions that the paper compares (appendix D, Table 11): denoise it, or flow it.
+"""The two generative heads of the paper's comparison (appendix D, Table 11): diffusion and normalising flow.
 
-Both work on actions normalised by each step's own mean and deviation over the data set, stored with the weights. An
-*action* is what is integrated into the trajectory: an increment (dx m, dy m, dθ rad), or, of the parameterisation
-`offsets`, a position and an increment of the heading.
+Both work on actions normalised by each step's mean and deviation over the data set, stored with the weights. An
+*action* is integrated into the trajectory: an increment (dx m, dy m, dθ rad), or, with the parameterisation `offsets`,
+a position and an increment of the heading.
 
-What inference starts from, `noise`, is a buffer stored with the weights, where the paper draws anew: a plan is a
-function of its inputs, a graph is the same bytes when written again, and ticks do not alternate between two equal ways.
+Inference starts from `noise`, a buffer stored with the weights; the paper draws new noise instead. So a plan is a
+function of its inputs, a graph written again has the same bytes, and ticks do not alternate between two equal routes.
 
-* Diffusion: one Gaussian sample of the weights' seed, since the denoiser never sees an input without noise.
-* Flow: zero, the mode of the base, which the couplings map to the centre of what they learned.
+* Diffusion: one Gaussian sample of the weights' seed, because the denoiser was trained on noisy inputs only.
+* Flow: zero, the mode of the base distribution, which the couplings map to the centre of the learned distribution.
 """
 
 from __future__ import annotations
@@ -24,39 +24,39 @@ from export.model.attention import CrossAttentionLayer, KeyValue, TypedModuleLis
 from export.model.config import ActionConfig
 
 MIN_STD = 1e-3
-"""Smallest deviation that an action is divided by: 1 mm or 1 mrad a step, below which there is nothing to learn."""
+"""Smallest deviation used as divisor, 1 mm or 1 mrad a step: smaller variation is not worth learning."""
 MAX_BETA = 0.999
 COSINE_OFFSET = 0.008
-"""Of the cosine schedule (Nichol and Dhariwal 2021, equation 17)."""
+"""Offset s of the cosine schedule (Nichol and Dhariwal 2021, equation 17)."""
 TIME_PERIOD = 1e4
 MAX_LOG_SCALE = 2.0
-"""Of one coupling: data that hardly varies would else make the likelihood grow without bound."""
+"""Bound on a coupling's log scale: nearly constant data would make the likelihood grow without limit."""
 
 
 def drawn(
     kind: Callable[..., Tensor], shape: tuple[int, ...], device: torch.device, generator: torch.Generator | None
 ) -> Tensor:
-    """`torch.rand` or `torch.randn` of a shape: by the generator, wherever it lives, else by torch's own."""
+    """Draw `torch.rand` or `torch.randn` of a shape with a generator on any device, else with torch's own."""
     place = device if generator is None else generator.device
     return kind(shape, generator=generator, device=place).to(device)
 
 
 def integrated(actions: Tensor, parameterisation: str) -> Tensor:
-    """Actions [B, steps, 3] → trajectory [B, steps, 3] (x m, y m, θ rad) in the current robot frame."""
+    """Integrate actions [B, steps, 3] to a trajectory [B, steps, 3] (x m, y m, θ rad) in the current robot frame."""
     if parameterisation == "increments":
         return torch.cumsum(actions, dim=1)
     return torch.cat([actions[..., :2], torch.cumsum(actions[..., 2:], dim=1)], dim=-1)
 
 
 def differentiated(trajectory: Tensor, parameterisation: str) -> Tensor:
-    """The inverse of `integrated`; headings may be wrapped, increments of them are within ±π."""
+    """Invert `integrated`; headings may be wrapped, their increments are within ±π."""
     steps = torch.diff(trajectory, dim=1, prepend=torch.zeros_like(trajectory[:, :1]))
     position = steps[..., :2] if parameterisation == "increments" else trajectory[..., :2]
     return torch.cat([position, wrapped(steps[..., 2:])], dim=-1)
 
 
 def wrapped(angle: Tensor) -> Tensor:
-    """Angles in rad between −π and π."""
+    """Wrap angles to −π…π, rad."""
     return torch.atan2(torch.sin(angle), torch.cos(angle))
 
 
@@ -73,12 +73,12 @@ class ActionScale(nn.Module):
         self.register_buffer("std", torch.ones(1, config.steps, 3))
 
     def start(self) -> None:
-        """As the query head begins: around a slow walk straight ahead."""
+        """Initialise to a slow walk straight ahead, as the query head does."""
         self.mean.copy_(torch.tensor(self._start).expand_as(self.mean))
         self.std.fill_(1.0)
 
     def fit(self, actions: Tensor, known: Tensor | None = None) -> None:
-        """Take mean and deviation from a data set's actions [N, steps, 3], of which `known` [N, steps]."""
+        """Compute mean and deviation of a data set's actions [N, steps, 3], valid where `known` [N, steps]."""
         weight = torch.ones_like(actions[..., :1]) if known is None else known[..., None]
         weight = weight.double()
         count = weight.sum(dim=0, keepdim=True)
@@ -91,17 +91,17 @@ class ActionScale(nn.Module):
             self.std.copy_(variance.sqrt().clamp(min=MIN_STD))
 
     def normalised(self, actions: Tensor) -> Tensor:
-        """Actions without unit, of mean 0 and deviation 1 at every step."""
+        """Normalise actions to mean 0 and deviation 1 at every step."""
         return (actions.float() - self.mean) / self.std
 
     def forward(self, normalised: Tensor) -> Tensor:
-        """The inverse of `normalised`: actions in m and rad."""
+        """Invert `normalised`; returns actions in m and rad."""
         return normalised.float() * self.std + self.mean
 
 
 @lru_cache
 def cosine_schedule(levels: int) -> tuple[float, ...]:
-    """Share of the clean signal's power left at each noise level, from the least noise to the most (paper: cosine)."""
+    """Return the clean signal's share of power at each noise level, least noise first (paper: cosine schedule)."""
 
     def left(level: int) -> float:
         return math.cos((level / levels + COSINE_OFFSET) / (1 + COSINE_OFFSET) * math.pi / 2) ** 2
@@ -115,9 +115,9 @@ def cosine_schedule(levels: int) -> tuple[float, ...]:
 
 @lru_cache
 def ddim_steps(levels: int, count: int) -> tuple[tuple[int, float, float], ...]:
-    """DDIM without added noise in `count` steps: (noise level, a, b) of x ← a·x + b·(clean actions as predicted).
+    """Return `count` deterministic DDIM steps (noise level, a, b) of x ← a·x + b·(predicted clean actions).
 
-    Levels are spread evenly from the noisiest; the last step gives the prediction itself (a 0, b 1).
+    Levels are evenly spaced from the noisiest; the last step returns the prediction (a 0, b 1).
     """
     shares = cosine_schedule(levels)
     times = [round(levels * i / count) - 1 for i in range(count, 0, -1)]
@@ -130,16 +130,16 @@ def ddim_steps(levels: int, count: int) -> tuple[tuple[int, float, float], ...]:
 
 
 def time_embedding(times: Tensor, width: int) -> Tensor:
-    """Noise levels [B] → sines and cosines [B, width] of wavelengths up to 2π·TIME_PERIOD."""
+    """Embed noise levels [B] as sines and cosines [B, width] of wavelengths up to 2π·TIME_PERIOD."""
     rates = TIME_PERIOD ** (-torch.arange(width // 2, device=times.device, dtype=torch.float32) / (width // 2))
     angles = times.float()[:, None] * rates
     return torch.cat([angles.sin(), angles.cos()], dim=-1)
 
 
 class Diffusion(nn.Module):
-    """Around the denoiser: noisy actions and their noise level as tokens, and the sampling by DDIM.
+    """Diffusion head: embeds noisy actions and noise level as tokens, and samples by DDIM.
 
-    The denoiser itself is the expert's own transformer; its learned queries serve as the positions of the tokens.
+    The denoiser is the expert's transformer; its learned queries are the tokens' positions.
     """
 
     noise: Tensor
@@ -152,21 +152,21 @@ class Diffusion(nn.Module):
         self.register_buffer("noise", torch.zeros(1, config.steps, 3))
 
     def start(self, generator: torch.Generator) -> None:
-        """Draw what every chunk is denoised from."""
+        """Draw the noise from which every chunk is denoised."""
         self.noise.normal_(generator=generator)
 
     def time_tokens(self, times: Tensor) -> Tensor:
-        """What a noise level [B] adds to every token: [B, 1, hidden]."""
+        """Embed noise levels [B] as a summand of every token, [B, 1, hidden]."""
         tokens: Tensor = self.time_projection(time_embedding(times, self.config.hidden))
         return tokens[:, None]
 
     def tokens(self, noisy: Tensor, times: Tensor, positions: Tensor) -> Tensor:
-        """Noisy normalised actions [B, steps, 3] at levels [B] → tokens [B, steps, hidden]."""
+        """Embed noisy normalised actions [B, steps, 3] at levels [B] as tokens [B, steps, hidden]."""
         tokens: Tensor = self.action_in(noisy) + positions + self.time_tokens(times)
         return tokens
 
     def corrupted(self, clean: Tensor, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
-        """Clean normalised actions at noise levels [B] drawn evenly: what the denoiser is trained on."""
+        """Add noise to clean normalised actions at uniformly drawn levels; returns the noisy actions and levels [B]."""
         levels = self.config.diffusion_steps
         times = (drawn(torch.rand, clean.shape[:1], clean.device, generator) * levels).long().clamp(max=levels - 1)
         share = torch.tensor(cosine_schedule(levels), device=clean.device)[times][:, None, None]
@@ -174,7 +174,7 @@ class Diffusion(nn.Module):
         return share.sqrt() * clean + (1 - share).sqrt() * noise, times
 
     def sample(self, denoise: Callable[[Tensor, Tensor], Tensor], batch: int) -> Tensor:
-        """Normalised actions [batch, steps, 3] by `denoise`: noisy actions and levels → clean actions."""
+        """Sample normalised actions [batch, steps, 3] with `denoise`: (noisy actions, levels) → clean actions."""
         x = self.noise.expand(batch, -1, -1)
         for time, a, b in ddim_steps(self.config.diffusion_steps, self.config.ddim_steps):
             x = a * x + b * denoise(x, torch.full((batch,), time, device=x.device)).float()
@@ -182,7 +182,7 @@ class Diffusion(nn.Module):
 
 
 class Coupling(nn.Module):
-    """Affine map of one half of a chunk's steps by what the other half is, and by what the expert sees."""
+    """Affine map of half of a chunk's steps, conditioned on the other half and on the expert's features."""
 
     def __init__(self, hidden: int, heads: int) -> None:
         super().__init__()
@@ -193,9 +193,9 @@ class Coupling(nn.Module):
         self.out = nn.Linear(hidden, 6)
 
     def forward(self, given: Tensor, given_features: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Logarithm of the scale, and shift, [B, S, 3] each, of the steps with `features` [B, S, hidden].
+        """Compute log scale and shift, [B, S, 3] each, of the steps with `features` [B, S, hidden].
 
-        `given` [B, G, 3] are the other steps' actions, `given_features` what the expert sees for those.
+        `given` [B, G, 3]: the other steps' actions; `given_features`: their features.
         """
         x = self.layer(features, *self.key_value(given_features + self.action_in(given)))
         log_scale, shift = self.out(self.norm(x)).float().chunk(2, dim=-1)
@@ -203,9 +203,9 @@ class Coupling(nn.Module):
 
 
 class Flow(nn.Module):
-    """Normalising flow of couplings, which move even and odd steps in turn (even steps first and last of five).
+    """Normalising flow of couplings that map even and odd steps alternately (even steps first and last of five).
 
-    Neighbouring steps determine one another nearly completely, which a coupling can use.
+    Neighbouring steps are strongly correlated, which a coupling can use.
     """
 
     noise: Tensor
@@ -216,11 +216,11 @@ class Flow(nn.Module):
         self.register_buffer("noise", torch.zeros(1, config.steps, 3))
 
     def start(self) -> None:
-        """Begin at the mode of the base."""
+        """Set the noise to the mode of the base distribution."""
         self.noise.zero_()
 
     def sample(self, features: Tensor) -> Tensor:
-        """Features [B, steps, hidden] → normalised actions [B, steps, 3]."""
+        """Map features [B, steps, hidden] to normalised actions [B, steps, 3]."""
         halves, seen = halved(self.noise.expand(len(features), -1, -1)), halved(features)
         for index, coupling in enumerate(self.couplings):
             moved, given = index % 2, 1 - index % 2
@@ -229,7 +229,7 @@ class Flow(nn.Module):
         return woven(halves)
 
     def surprise(self, actions: Tensor, features: Tensor) -> Tensor:
-        """−log p of normalised actions [B, steps, 3], exactly, as one term a number; their sum is the chunk's."""
+        """Compute −log p of normalised actions [B, steps, 3] as one term per number; a chunk's −log p is their sum."""
         halves, seen = halved(actions), halved(features)
         scales = [torch.zeros_like(half) for half in halves]
         for index in reversed(range(len(self.couplings))):
@@ -242,15 +242,15 @@ class Flow(nn.Module):
 
 
 def halved(x: Tensor) -> list[Tensor]:
-    """Even and odd steps of [B, steps, …]."""
+    """Split [B, steps, …] into even and odd steps."""
     return [x[:, 0::2], x[:, 1::2]]
 
 
 def woven(halves: list[Tensor]) -> Tensor:
-    """The inverse of `halved`."""
+    """Invert `halved`."""
     return torch.cat(halves, dim=1)[:, weave(sum(half.shape[1] for half in halves))]
 
 
 def weave(steps: int) -> list[int]:
-    """Where every step lies among the even steps followed by the odd ones."""
+    """Return each step's index in the sequence of even steps followed by odd ones."""
     return [step // 2 + (steps + 1) // 2 * (step % 2) for step in range(steps)]

@@ -24,7 +24,7 @@ class RmsNorm(nn.Module):
 
 
 def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
-    """Rotary position embedding of [n, heads, t, d] by per-position angles [t, d]."""
+    """Apply the rotary position embedding with angles [t, d] to [n, heads, t, d]."""
     first, second = x.chunk(2, dim=-1)
     return x * cos + torch.cat([-second, first], dim=-1) * sin
 
@@ -67,7 +67,7 @@ class DecoderLayer(nn.Module):
 
 
 class LanguageModel(nn.Module):
-    """One call serves prefill and decode: new tokens in, next token and the grown KV cache out.
+    """Decoder for prefill and decode: reads new tokens, returns the next token and the extended KV cache.
 
     `input_ids` [1, S], `visual_tokens` [F, N, D] (the frames whose `<IMG_CONTEXT>` tokens are in this call, in order;
     any one frame when there are none), `past` = 2·layers tensors [1, kv_heads, P, head_dim] (k0, v0, k1, v1, …).
@@ -91,19 +91,19 @@ class LanguageModel(nn.Module):
         self.register_buffer("inv_freq", inv_freq, persistent=False)
 
     def embed_inputs(self, input_ids: Tensor, visual_tokens: Tensor, image_offset: int = 0) -> Tensor:
-        """Token embeddings [1, S, hidden] with frames in the places of `<IMG_CONTEXT>`, from `image_offset` on."""
+        """Embed tokens [1, S, hidden]; visual tokens replace `<IMG_CONTEXT>`, from `image_offset` on."""
         images = self.merge(fold_tokens(visual_tokens, self.config.token_merge))
         images = images.reshape(-1, self.config.hidden)
         is_image = input_ids[0] == self.config.img_context_id
         place = (torch.cumsum(is_image.long(), dim=0) - 1 + image_offset).clamp(min=0)
-        # More image places than image tokens cannot come from our prompt builder; clamping keeps the gather in range.
+        # The prompt builder never makes more image positions than image tokens; clamping keeps the gather in range.
         place = torch.minimum(place, torch.full_like(place, 1) * (images.shape[0] - 1))
         return torch.where(is_image[:, None], images[place], self.embed(input_ids[0]))[None]
 
     def hidden_states(
         self, input_ids: Tensor, visual_tokens: Tensor, past: list[Tensor], image_offset: int = 0
     ) -> tuple[Tensor, list[Tensor], Tensor]:
-        """Final hidden states [1, S, hidden], grown caches, and the new tokens' last-layer K‖V [1, S, kv_dim]."""
+        """Compute final hidden states [1, S, hidden], extended caches, new tokens' last-layer K‖V [1, S, kv_dim]."""
         x = self.embed_inputs(input_ids, visual_tokens, image_offset)
         new, old = input_ids.shape[1], past[0].shape[2]
         position = torch.arange(new, device=x.device) + old
@@ -122,7 +122,7 @@ class LanguageModel(nn.Module):
     def forward(
         self, input_ids: Tensor, visual_tokens: Tensor, past: list[Tensor], image_offset: int = 0
     ) -> tuple[Tensor, ...]:
-        """`next_token` [1, 1], `logits` [1, vocab] of the last position, `last_layer_kv` [1, S, kv_dim], caches."""
+        """Compute `next_token` [1, 1], last `logits` [1, vocab], `last_layer_kv` [1, S, kv_dim] and caches."""
         x, present, last_layer_kv = self.hidden_states(input_ids, visual_tokens, past, image_offset)
         logits = self.lm_head(x[:, -1])
         return logits.argmax(-1, keepdim=True), logits, last_layer_kv, *present

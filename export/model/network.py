@@ -19,16 +19,16 @@ from export.model.vision import VisionEncoder
 INIT_STD = 0.02
 HEAD_STD = 3e-4
 PLACE_RMS: Final = 0.5
-"""Of the numbers of a place's code; those of tokens are about 1.
+"""Initial magnitude of a position's code; token values are about 1.
 
-Places learned from nearly nothing were still nearly nothing after a thousand steps, beside tokens forty times as large.
+Position codes that started near zero were still negligible after 1000 steps, beside tokens forty times as large.
 """
-_SHORTEST: Final = 4.0  # wavelength, places
+_SHORTEST: Final = 4.0  # wavelength, positions
 PARTS = ("vision", "language", "action", "value")
 
 
 def line_codes(count: int, width: int) -> Tensor:
-    """Sines of every wavelength as codes of the places 0, 1, … on a line: [count, width] float32."""
+    """Return sinusoidal codes of the positions 0, 1, … on a line: [count, width] float32."""
     pairs = (width + 1) // 2
     lengths = _SHORTEST * float(count) ** (torch.arange(pairs) / max(pairs - 1, 1))
     angle = 2 * pi * torch.arange(count)[:, None] / lengths
@@ -36,13 +36,13 @@ def line_codes(count: int, width: int) -> Tensor:
 
 
 def grid_codes(count: int, width: int) -> Tensor:
-    """[count, width] float32: codes of a square's places, row by row; its rows in one half of the numbers.
+    """Return codes of a square's positions, row by row, [count, width] float32; half of each code is the row's.
 
-    Raises ValueError for a count that is no square.
+    Raises ValueError if `count` is no square.
     """
     side = isqrt(count)
     if side * side != count:
-        raise ValueError(f"places: expected a square number of tokens, found {count}")
+        raise ValueError(f"positions: expected a square number of tokens, found {count}")
     rows, columns = line_codes(side, width // 2), line_codes(side, width - width // 2)
     return torch.cat([rows.repeat_interleave(side, 0), columns.repeat(side, 1)], dim=1)
 
@@ -82,7 +82,7 @@ class TicVla(nn.Module):
 
 
 class _SkipRandomInit(TorchFunctionMode):
-    """Leaves out torch's own random initial weights: at paper size they cost seconds and are overwritten anyway."""
+    """Skips torch's random initial weights, which take seconds at paper size and are overwritten."""
 
     SKIPPED = (nn.init.kaiming_uniform_, nn.init.uniform_, nn.init.normal_)
 
@@ -99,20 +99,20 @@ class _SkipRandomInit(TorchFunctionMode):
 
 
 def empty_network(config: TicVlaConfig) -> TicVla:
-    """A network in evaluation mode whose random weights are still to be written (its norms and buffers are set)."""
+    """Create a network in evaluation mode with unset weights; norms and buffers are set."""
     with _SkipRandomInit():
         return TicVla(config).eval()
 
 
 def initialise(model: TicVla, seed: int, parts: Sequence[str] = PARTS) -> None:
-    """Fill every weight of `parts` from one generator, so that a seed names the same weights on every machine."""
+    """Fill every weight of `parts` from one generator, so that a seed gives the same weights on every machine."""
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         for name, module in model.named_modules():
             if name.split(".")[0] not in parts:
                 continue
             if isinstance(module, nn.Conv1d | nn.Conv2d):
-                # He initialisation: with 0.02 the signal of a frame would fade to nothing in a stack of convolutions.
+                # He initialisation: with 0.02 a frame's signal would vanish in a stack of convolutions.
                 fan_in = module.weight[0].numel()
                 module.weight.normal_(0.0, (2.0 / fan_in) ** 0.5, generator=generator)
                 if module.bias is not None:
@@ -136,14 +136,14 @@ def initialise(model: TicVla, seed: int, parts: Sequence[str] = PARTS) -> None:
         if "action" in parts:
             visual, semantic = model.action.visual_position[0], model.action.semantic_position[0]
             visual += grid_codes(*visual.shape)
-            semantic += line_codes(*semantic.shape).flip(0)  # place 0 is the last token
-            # Two tokens among hundreds, state and latency: they are to be found before they are understood.
+            semantic += line_codes(*semantic.shape).flip(0)  # position 0 is the last token
+            # State and latency are two tokens among hundreds: larger initial codes let attention find them.
             model.action.metadata_position.mul_(PLACE_RMS / INIT_STD)
             model.action.start(generator)
 
 
 def build(config: TicVlaConfig, seed: int) -> TicVla:
-    """An untrained network in evaluation mode with the weights that `seed` names."""
+    """Create an untrained network in evaluation mode with the weights of a seed."""
     model = empty_network(config)
     initialise(model, seed)
     return model

@@ -89,6 +89,6 @@ class VisionEncoder(nn.Module):
         x = torch.cat([self.cls.expand(x.shape[0], -1, -1), x], dim=1) + self.position
         for block in self.blocks:
             x = block(x)
-        # CLS is dropped and there is no final norm: what InternVL feeds its projector.
+        # No CLS token and no final norm, like the input of InternVL's projector.
         tokens: Tensor = self.projector(fold_tokens(x[:, 1:], self.config.pixel_shuffle))
         return tokens

@@ -17,11 +17,11 @@ FORMAT = "tic-vla-edge/1"
 
 
 class WeightsError(ValueError):
-    """A weights file that is not what its reader was asked for."""
+    """Weights file with unexpected content."""
 
 
 class CheckpointError(WeightsError):
-    """A checkpoint that is not the network asked for; its text is the one line to show."""
+    """Checkpoint that does not match the network; its text is the one line to show."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class WeightsInfo:
 
 
 def weights_sha256(model: TicVla) -> str:
-    """Hash of every tensor's name, shape and bytes; independent of the file it came from."""
+    """Hash every tensor's name, shape and bytes, independent of its file."""
     digest = hashlib.sha256()
     for name, tensor in sorted(model.state_dict().items()):
         digest.update(f"{name}:{tuple(tensor.shape)}:{tensor.dtype}".encode())
@@ -42,7 +42,7 @@ def weights_sha256(model: TicVla) -> str:
 
 
 def save_weights(model: TicVla, path: Path, info: WeightsInfo, parts: Sequence[str] = PARTS) -> None:
-    """Write the weights of `parts` in one rename; raises OSError."""
+    """Write the weights of `parts` atomically. Raises OSError."""
     metadata = {
         "format": FORMAT,
         "config": json.dumps(model.config.to_dict(), sort_keys=True),

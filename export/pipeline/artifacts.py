@@ -1,4 +1,4 @@
-"""Building an artifact directory: files from the cache, gate, manifest; written aside, then renamed into place."""
+"""Builds an artifact directory from cached files, gates and manifest in a hidden directory, then renames it."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ NEW, OLD = "new", "old"
 RUNNER_KEYS = ("control_cores", "reasoning_cores", "control_priority", "decoding", "recovery")
 SHOWN_CHARACTERS = 60
 OLDER_SCHEMAS = (1, 2)
-"""Schemas whose directories an export replaces."""
+"""Manifest schemas whose directories an export may replace."""
 
 
 def manifest_runtime(target: Target, config: TicVlaConfig, made: Plan) -> dict[str, object]:
-    """The manifest's `runtime` section; a plan that fits limits the tokens of a generation."""
+    """Return the manifest's `runtime` section; a plan that fits limits the tokens of a generation."""
     language, policy = config.language, target.runtime
     planned = made.tokens if made.fits and made.tokens > 0 else policy.max_new_tokens
     return {
@@ -54,8 +54,10 @@ def manifest_runtime(target: Target, config: TicVlaConfig, made: Plan) -> dict[s
 
 
 def build_artifacts(job: Job, out: Path, cache: StageCache, progress: BuildProgress) -> dict[str, Any]:
-    """Write `out` and return its report; raises GateError, ArtifactError, CheckpointError or OSError and then leaves
-    nothing behind but finished stages in the cache."""
+    """Write `out` and return its report.
+
+    Raises GateError, ArtifactError, CheckpointError or OSError; then only finished stages stay, in the cache.
+    """
     check_replaceable(out)
     with workplace(out) as work:
         made = work / NEW
@@ -63,16 +65,16 @@ def build_artifacts(job: Job, out: Path, cache: StageCache, progress: BuildProgr
         report = _write_directory(Pipeline(job, cache, progress), made, progress)
         for path in [*made.iterdir(), made]:
             fsync_path(path)
-        check_replaceable(out)  # once more: building took its time
+        check_replaceable(out)  # again, because the directory may have changed during the build
         _swap(made, out, work / OLD)
         return report
 
 
 @contextmanager
 def workplace(out: Path) -> Iterator[Path]:
-    """A hidden directory beside `out`, on the same disk, for one export at a time; raises ArtifactError for a second.
+    """Create a hidden directory beside `out`, on the same disk. Raises ArtifactError if another export uses it.
 
-    What a killed export left in it goes; the directory that it was just replacing comes back.
+    Leftovers of a killed export are deleted; a directory that it was replacing is restored.
     """
     work = out.with_name(f".{out.name}.edge-export")
     work.mkdir(parents=True, exist_ok=True)
@@ -87,7 +89,9 @@ def workplace(out: Path) -> Iterator[Path]:
             raise ArtifactError(f"another export is writing {out}; wait for it or name another directory")
         others = sorted(path.name for path in work.iterdir() if path.name not in (NEW, OLD))
         if others:
-            raise ArtifactError(f"{work / others[0]}: not ours, so nothing is built there; move it away")
+            raise ArtifactError(
+                f"{work / others[0]}: not written by edge-export, so nothing is built there; move it away"
+            )
         if (work / OLD).exists() and not out.exists():
             (work / OLD).rename(out)
         try:
@@ -101,17 +105,19 @@ def workplace(out: Path) -> Iterator[Path]:
 
 
 def check_replaceable(out: Path) -> None:
-    """An existing directory is replaced only if it is empty, or of ours with nothing of the user's beside it."""
+    """Refuse to replace a directory unless it is empty or holds only files of an export."""
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return
     listed = {MANIFEST_NAME, *_files_of(out)}
     others = sorted(path.name for path in out.iterdir() if path.name not in listed)
     if others:
-        raise ArtifactError(f"{out / others[0]}: not ours, so {out} is not replaced; name another directory")
+        raise ArtifactError(
+            f"{out / others[0]}: not written by edge-export, so {out} is not replaced; name another directory"
+        )
 
 
 def _files_of(out: Path) -> dict[str, Any]:
-    """The files that a manifest lists, also one of an older schema if all of them match it."""
+    """Return the files that a manifest lists; those of an older schema only if all match it."""
     try:
         return dict(read_manifest(out)["files"])
     except ArtifactError:
@@ -154,7 +160,7 @@ def _write_directory(pipeline: Pipeline, directory: Path, progress: BuildProgres
     for name in job.target.graph_names:
         files = pipeline.graph(name)
         for path in files:
-            # Copied, never linked: what happens to the output must not reach the cache.
+            # Copied, never linked: a change of the output must not change the cache.
             shutil.copyfile(path, directory / path.name)
         graphs[name] = _graph_entry(pipeline, name, [directory / path.name for path in files])
     manifest: dict[str, Any] = {
@@ -169,7 +175,7 @@ def _write_directory(pipeline: Pipeline, directory: Path, progress: BuildProgres
             "weights_origin": weights.origin,
             "calibration": job.calibration.to_dict(),
             "packages": package_versions(),
-            "asked": asdict(job.asked),
+            "asked": asdict(job.request),
             "target": job.target.to_dict(),
         },
     }
@@ -204,7 +210,7 @@ def _graph_entry(pipeline: Pipeline, name: str, files: list[Path]) -> dict[str, 
 
 
 def _write_json(path: Path, content: Mapping[str, object]) -> None:
-    # Not sorted: of a precision's exceptions the first that matches wins.
+    # Not sorted: the first matching exception of a precision applies, so their order matters.
     path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
@@ -217,24 +223,24 @@ def _write_manifest(directory: Path, manifest: dict[str, Any]) -> None:
 
 
 def check_directory(pipeline: Pipeline, directory: Path, progress: BuildProgress) -> dict[str, GateResult]:
-    """The gate through the runner's own loader, on the bytes on disk; raises GateError at the first failure."""
+    """Run the gates on the files on disk, through the runner's loader. Raises GateError at the first failure."""
     artifacts = load_artifacts(directory)
     results: dict[str, GateResult] = {}
     for name in pipeline.job.target.graph_names:
         result = results[name] = pipeline.gate(artifacts, name)
         require(name, result.verdict)
         if result.verdict.level == WARN:
-            progress.say(f"{name}: near a limit: {'; '.join(result.verdict.reasons)}")
+            progress.log(f"{name}: near a limit: {'; '.join(result.verdict.reasons)}")
     return results
 
 
 def verify_directory(job: Job, directory: Path, cache: StageCache, progress: BuildProgress) -> dict[str, Any]:
-    """Hashes, contract and gates of an existing directory once more; raises ArtifactError or GateError."""
+    """Check hashes, contract and gates of an existing directory again. Raises ArtifactError or GateError."""
     manifest = read_manifest(directory)
     pipeline = Pipeline(job, cache, progress, run_gates=True)
     weights = pipeline.weights()
     if weights.sha256 != manifest["provenance"].get("weights_sha256"):
-        raise ArtifactError(f"{directory}: was made from other weights than {weights.origin}; pass --checkpoint")
+        raise ArtifactError(f"{directory}: built from other weights than {weights.origin}; pass --checkpoint")
     _check_manifest(pipeline, directory, manifest)
     pipeline.task_reference()
     for name in job.target.graph_names:
@@ -254,7 +260,7 @@ def _model_section(pipeline: Pipeline) -> dict[str, Any]:
 
 
 def _check_manifest(pipeline: Pipeline, directory: Path, manifest: Mapping[str, Any]) -> None:
-    """Everything that a runner goes by is what this export would write; raises ArtifactError naming the first key."""
+    """Check that all values that a runner reads equal this export's. Raises ArtifactError that names the first key."""
     job, graphs = pipeline.job, manifest["graphs"]
     expected: dict[str, Any] = {
         "target": job.target.name,
@@ -276,22 +282,22 @@ def _check_manifest(pipeline: Pipeline, directory: Path, manifest: Mapping[str, 
         if difference is not None:
             raise ArtifactError(f"{directory / MANIFEST_NAME}: {difference}; export again")
     if (directory / TOKENIZER_NAME).read_bytes() != pipeline.tokenizer():
-        raise ArtifactError(f"{directory / TOKENIZER_NAME}: not the tokenizer that goes with the weights; export again")
+        raise ArtifactError(f"{directory / TOKENIZER_NAME}: not the tokenizer of these weights; export again")
 
 
 def _difference(found: object, expected: object, key: str) -> str | None:
-    """The first key at which two JSON values differ, with both, in words; None when they are the same."""
+    """Describe the first key at which two JSON values differ, with both values; None if they are equal."""
     if isinstance(found, dict) and isinstance(expected, dict):
         for name in [*expected, *(name for name in found if name not in expected)]:
             below = f"{key}.{name}"
             if name not in found:
                 return f"{below} is missing"
             if name not in expected:
-                return f"{below} is of no export"
+                return f"{below} is not part of an export"
             difference = _difference(found[name], expected[name], below)
             if difference is not None:
                 return difference
-        # Of a precision's exceptions the first that matches wins.
+        # The first matching exception of a precision applies, so their order matters.
         return None if list(found) == list(expected) or not key.endswith("overrides") else f"{key} is in another order"
     same = type(found) is type(expected) and found == expected
     return None if same else f"{key} is {_shown(found)}, this export writes {_shown(expected)}"

@@ -1,4 +1,4 @@
-"""The stages of a build, each under the hash of what it follows from; PyTorch is loaded by the first that needs it."""
+"""Stages of a build, each cached under the hash of its inputs; the first stage that needs PyTorch loads it."""
 
 from __future__ import annotations
 
@@ -54,9 +54,9 @@ TOKENIZER_FILE = "tokenizer.json"
 SAMPLES_FILE = "samples.safetensors"
 OUTPUTS_FILE = "outputs.safetensors"
 GATE_MARGIN = 0.7
-"""Share of the gate's error that the search may use: it sees prompts, the gate the worst of its inputs."""
+"""Share of the gate's limit that the search may use: the search tests prompts, the gate the worst of its inputs."""
 RANGE_FRAMES = 8
-"""Frames of the calibration set over which ranges of activations are taken, evenly spread."""
+"""Number of calibration frames, evenly spread, that determine the ranges of activations."""
 
 WEIGHTS_CODE = ("export.pipeline.job", "export.checkpoint.load", "export.checkpoint.tokenizer", "export.model.weights")
 REFERENCE_CODE = ("export.evaluation.parity",)
@@ -65,7 +65,7 @@ PRECISION_CODE = ("export.evaluation.precision_search",)
 RANGES_CODE = ("export.quantize.rounding",)
 GRAPH_CODE = ("export.graphs.build",)
 GATE_CODE = ("export.evaluation.gates", "export.evaluation.parity")
-"""The modules that make each kind of stage; what they import counts too (`cache.source_sha256`)."""
+"""Modules of each kind of stage; their hash includes their imports (`cache.source_sha256`)."""
 
 EXPECTED_S = {
     "weights": (0.3, 30.0),
@@ -77,17 +77,17 @@ EXPECTED_S = {
     "gate": (2.0, 45.0),
     "plan and report": (0.2, 1.0),
 }
-"""Seconds to expect of each kind of stage before it was ever measured here: for a small and for a large model."""
+"""Expected duration of each kind of stage before the first measurement, s: for a small and for a large model."""
 
 
 COMPUTING = ("vision_encoder", "language_model.prefill")
-"""Graphs whose time goes into products rather than into reading weights."""
+"""Graphs whose time is limited by computing, not by reading weights."""
 
 
 def with_exceptions(chosen: Precision, asked: Precision) -> Precision:
-    """What the search chose, and the exceptions that the target asks for where they are more exact than its default.
+    """Combine the search's choice with the target's exceptions that are more exact than the chosen default.
 
-    Of two for one layer the more exact wins, whatever its source.
+    For a layer with two exceptions the more exact one applies.
     """
     order = PRECISIONS.index
     exact = [(layer, kind) for layer, kind in asked.overrides if order(kind) < order(chosen.default)]
@@ -98,7 +98,7 @@ def with_exceptions(chosen: Precision, asked: Precision) -> Precision:
 
 
 def machine_name() -> str:
-    """What decides which kernels compute: a result that was measured here is not one of another processor."""
+    """Return the processor's name, on which the choice of kernels and so a measured result depends."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -108,7 +108,7 @@ def machine_name() -> str:
 
 
 def build_stages(job: Job, known_s: Mapping[str, float], *, graphs: bool = True) -> list[Stage]:
-    """All stages in their order (without those that write graphs), with the seconds they took last time or usually."""
+    """List the stages in order with their last or usual duration, s; without graph stages unless `graphs`."""
     column, order = int(is_large(job.config)), job.target.graph_names
     searched = [graph for graph in order if len(job.target.graphs[graph].candidates) > 1]
     names = ["weights", "task reference", *(f"reference {graph}" for graph in order)]
@@ -126,7 +126,7 @@ def build_stages(job: Job, known_s: Mapping[str, float], *, graphs: bool = True)
 
 @dataclass(frozen=True)
 class WeightsRecord:
-    """What the weights stage found."""
+    """Result of the weights stage."""
 
     sha256: str
     trained: bool
@@ -135,9 +135,9 @@ class WeightsRecord:
 
 
 class Pipeline:
-    """One build's stages; every method returns what is in the cache or makes it.
+    """Stages of one build; every method returns the cached result or computes it.
 
-    With `run_gates`, gates run even where the same bytes have passed before: that is what `verify` is for.
+    With `run_gates`, gates run even if the same bytes have passed before, as `verify` needs.
     """
 
     def __init__(self, job: Job, cache: StageCache, progress: BuildProgress, *, run_gates: bool = False) -> None:
@@ -151,7 +151,7 @@ class Pipeline:
         torch.set_num_threads(self._threads)
 
     def _stage(self, title: str, key: str, build: Callable[[Path], None]) -> Path:
-        """One stage in the cache, shown as it runs; within a build it is verified once."""
+        """Run or fetch one stage with progress; within a build its entry is checked once."""
         if key not in self._entries:
             with self._progress.stage(title) as watch:
                 self._entries[key], cached = self._cache.fetch_or_build(key, build)
@@ -160,7 +160,7 @@ class Pipeline:
         return self._entries[key]
 
     def _json_stage(self, title: str, key: str, compute: Callable[[], Mapping[str, object]]) -> dict[str, Any]:
-        """One stage whose result is plain JSON, in the order in which it was computed."""
+        """Run or fetch one stage whose result is plain JSON; keeps the order of keys."""
 
         def build(directory: Path) -> None:
             (directory / RESULT_NAME).write_text(json.dumps(compute(), allow_nan=False), encoding="utf-8")
@@ -171,8 +171,11 @@ class Pipeline:
     def _key(
         self, stage: str, parts: Mapping[str, object], modules: tuple[str, ...], recipe: Callable[..., Any]
     ) -> str:
-        """Key of a stage, also of the method here that makes it (the whole module would undo all on every edit) and of
-        the threads that sum for it."""
+        """Return the key of a stage.
+
+        It also hashes the method of this class that computes the stage (not this module, whose every edit would
+        invalidate all stages) and the number of threads.
+        """
         parts = {**parts, "recipe": inspect.getsource(recipe), "threads": self._threads}
         return stage_key(stage, parts, modules)
 
@@ -181,7 +184,7 @@ class Pipeline:
         return WeightsRecord(**json.loads((self._weights_entry / WEIGHTS_FILE).read_text(encoding="utf-8")))
 
     def tokenizer(self) -> bytes:
-        """tokenizer.json that goes with the weights."""
+        """Return tokenizer.json for the weights."""
         return (self._weights_entry / TOKENIZER_FILE).read_bytes()
 
     @cached_property
@@ -201,17 +204,17 @@ class Pipeline:
         return self._stage("weights", key, build)
 
     def _parts(self, **more: Any) -> dict[str, Any]:
-        """Parts of every key that depends on the network: its weights, wherever they came from, and the rest."""
+        """Return the parts of a key that depends on the network: the hash of its weights, and further parts."""
         return {"weights": self.weights().sha256, "config": self.job.config.to_dict(), **more}
 
-    # ---- what PyTorch gives
+    # ---- PyTorch's outputs
 
     def _reference_key(self, graph: str) -> str:
         parts = self._parts(graph=graph, inputs=self.job.target.gate(graph).inputs)
         return self._key("reference", parts, REFERENCE_CODE, Pipeline.reference)
 
     def reference(self, graph: str) -> Path:
-        """Test inputs of a graph and PyTorch's outputs."""
+        """Return the file of a graph's test inputs and PyTorch's outputs."""
 
         def build(directory: Path) -> None:
             model = self.job.weights.loaded.model
@@ -221,7 +224,7 @@ class Pipeline:
 
     @cached_property
     def samples(self) -> SampleSet:
-        """Situations from the calibration set in which the robot is driven by an old semantic state."""
+        """Samples of the task error from the calibration set."""
         offsets_s = self.job.target.runtime.frame_offsets_s
         return samples_from(self.job.calibration, self.job.config, offsets_s, self.tokenizer())
 
@@ -234,7 +237,7 @@ class Pipeline:
         return self._key("task", parts, TASK_CODE, Pipeline.task_reference)
 
     def task_reference(self) -> Path:
-        """PyTorch's plans in those situations."""
+        """Return the file of PyTorch's plans for those samples."""
 
         def build(directory: Path) -> None:
             stages = TorchStages(self.job.weights.loaded.model)
@@ -247,16 +250,16 @@ class Pipeline:
     def _task_outputs(self) -> StageOutputs:
         return load_outputs(self.task_reference())
 
-    # ---- what ships
+    # ---- graphs and their precision
 
     def decision(self, graph: str) -> dict[str, Any] | None:
-        """What the sensitivity search chose for a graph and why; None where the target leaves no choice."""
+        """Return the search's precision for a graph with the reason; None if the target fixes the precision."""
         policy = self.job.target.graphs[graph]
         if len(policy.candidates) < 2:
             return None
         task, top1 = self.job.target.task_gate, self.job.target.gate(graph).top1
         limits = Limits(
-            # The search sees few situations: it has to stay clear of the gate, which sees all of them.
+            # The search tests few samples and the gate all, so the search keeps a margin to the gate's limits.
             waypoint_cm=task.warn_waypoint_cm or task.waypoint_cm,
             heading_deg=task.warn_heading_deg or task.heading_deg,
             speed_mps=task.speed_mps,
@@ -299,10 +302,10 @@ class Pipeline:
         return Search(loaded.model, samples, trained=loaded.info.trained, progress=self._progress.detail)
 
     def precision(self, graph: str) -> tuple[Precision, str]:
-        """Precision of a graph's layers and the reason for it."""
+        """Return the precision of a graph's layers and the reason for it."""
         decision, asked = self.decision(graph), self.job.target.precision(graph)
         if decision is None:
-            return asked, f"target {self.job.target.name} leaves no other choice"
+            return asked, f"target {self.job.target.name} fixes the precision"
         chosen = Precision.from_dict(decision["precision"])
         precision = with_exceptions(chosen, asked)
         added = [f"{layer} in {kind}" for layer, kind in precision.overrides if (layer, kind) not in chosen.overrides]
@@ -310,7 +313,7 @@ class Pipeline:
         return precision, f"{decision['reason']}{also}"
 
     def graph(self, graph: str) -> list[Path]:
-        """The graph's files."""
+        """Return the graph's files."""
         policy, half = self.job.target.graphs[graph], self.job.target.half
         precision, _ = self.precision(graph)
         ranges = self._ranges(graph, precision)
@@ -325,7 +328,7 @@ class Pipeline:
         return sorted(path for path in entry.iterdir() if path.name != ENTRY_NAME)
 
     def _ranges(self, graph: str, precision: Precision) -> dict[str, float] | None:
-        """Ranges of activations for an encoder whose form rounds them statically; None for all other graphs."""
+        """Return the ranges of activations for an encoder with static rounding; None for other graphs."""
         rounds = graph == "vision_encoder" and self.job.target.graphs[graph].form == "plain"
         if not rounds or "int8" not in (precision.default, *(kind for _, kind in precision.overrides)):
             return None
@@ -337,10 +340,10 @@ class Pipeline:
         parts = {"task": self._task_key(), "frames": RANGE_FRAMES}
         return self._json_stage("activation ranges", self._key("ranges", parts, RANGES_CODE, Pipeline._ranges), ranges)
 
-    # ---- whether it is the same model
+    # ---- comparison with PyTorch
 
     def gate(self, artifacts: Artifacts, graph: str) -> GateResult:
-        """Run a graph of the directory against PyTorch and hold it to the target's thresholds; raises GateError."""
+        """Compare a graph of the directory with PyTorch by the target's thresholds. Raises GateError."""
         contract, gate = artifacts.graphs[graph], self.job.target.gate(graph)
         provider = gate_provider(contract.session.provider)
 
@@ -384,7 +387,7 @@ class Pipeline:
         key = stage_key(what, parts, GATE_CODE)
         if not self._run_gates:
             return self._cache.result(key, lambda: asdict(measure()))
-        if key not in self._fresh:  # once for both halves of a pair
+        if key not in self._fresh:  # shared by both graphs of a pair
             self._fresh[key] = asdict(measure())
         return self._fresh[key], False
 

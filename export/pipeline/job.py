@@ -1,4 +1,4 @@
-"""What an export is asked for and where its weights come from, by the command line or by a directory's manifest."""
+"""The settings of an export and the source of its weights, from the command line or from a directory's manifest."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ DEFAULT_SEED = 0
 WHOLLY_RANDOM = re.compile(r"random seed (\d{1,19})")
 FILLED = re.compile(r"(?:^|; )action: random seed (\d{1,19})")
 DIRECTORY_FILES = ("config.json", "tokenizer.json")
-"""Read from a Hugging Face directory beside its weights."""
+"""Files of a Hugging Face directory that are read beside its weights."""
 
 
 class WeightSource:
-    """Checkpoints, or a seed, or neither: the weights that ship, if there are some, else a seed.
+    """Source of a network's weights: checkpoints or a seed; without either the shipped weights, else seed 0.
 
-    The network is loaded when a stage needs it, not before.
+    The network is loaded when a stage first needs it.
     """
 
     def __init__(self, config: TicVlaConfig, checkpoints: Sequence[Path], seed: int | None) -> None:
@@ -51,7 +51,10 @@ class WeightSource:
         self._seed = DEFAULT_SEED if seed is None and not checkpoints else seed
 
     def fingerprint(self) -> dict[str, object]:
-        """What identifies the weights without loading them: the files' hashes and the seed; raises CheckpointError."""
+        """Return the hashes of the files, the seed and the configuration, without loading the weights.
+
+        Raises CheckpointError.
+        """
         files: dict[str, str] = {}
         for path in self._checkpoints:
             source = open_source(path)
@@ -63,7 +66,7 @@ class WeightSource:
 
     @cached_property
     def loaded(self) -> LoadedCheckpoint:
-        """The network and the account of its weights; raises CheckpointError."""
+        """Network with its weights, and which tensors came from where. Raises CheckpointError."""
         if self._checkpoints:
             return load_checkpoint(self._checkpoints, self.config, fill_seed=self._seed)
         assert self._seed is not None
@@ -73,49 +76,50 @@ class WeightSource:
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What the command line named, by which `verify` finds target and network again without trusting their copies."""
+class ExportRequest:
+    """Target, model and settings as the command line named them; `verify` loads both by these names again."""
 
     target: str | None = None
-    """A target that is shipped; None for a file of the user's."""
+    """Name of a shipped target; None for the user's own file."""
     model: str | None = None
-    """A preset; None for a file of the user's."""
+    """Name of a preset; None for the user's own file."""
     settings: tuple[str, ...] = ()
     """Every `--set`, in order."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """Everything that an artifact directory follows from."""
+    """All inputs that determine an artifact directory."""
 
     target: Target
     weights: WeightSource
     calibration: CalibrationSet
-    asked: Asked = Asked()
+    request: ExportRequest = ExportRequest()
 
     def __post_init__(self) -> None:
         check_clips(self.calibration, self.target.runtime.frame_offsets_s)
 
     @property
     def config(self) -> TicVlaConfig:
-        """The network's numbers."""
+        """Configuration of the network."""
         return self.weights.config
 
 
 def job_of(
     directory: Path, checkpoints: Sequence[Path], seed: int | None, calibration: str | None
 ) -> tuple[Job, list[str]]:
-    """The job of a directory's manifest, and notes for the user; raises ArtifactError, WeightsError.
+    """Return the job that a directory's manifest records, and notes for the user.
 
-    Target and network are today's of the names that were asked for, with the `--set` of then: the manifest's own copies
-    vouch for nothing. Weights from files have to be named again: a manifest keeps no paths.
+    Raises ArtifactError, WeightsError. Target and network are loaded by the recorded names, with the recorded `--set`:
+    the manifest's own copies could have been changed. The user must name weight files again, because a manifest keeps
+    no paths.
     """
     manifest = read_manifest(directory)
     where = directory / MANIFEST_NAME
     try:
         provenance = manifest["provenance"]
-        asked = _asked(provenance["asked"])
-        target, config = _target_and_config(manifest, asked)
+        request = _request(provenance["asked"])
+        target, config = _target_and_config(manifest, request)
         recorded, origin = provenance["calibration"], str(provenance["weights_origin"])
         name, sha256 = str(recorded["name"]), str(recorded["sha256"])
     except (KeyError, TypeError, AttributeError, TargetError, ModelConfigError) as error:
@@ -128,7 +132,7 @@ def job_of(
         if random is None and (shipped := shipped_weights(config)) is not None:
             checkpoints = (shipped,)
         elif random is None:
-            raise WeightsError(f"{directory}: was made from {origin}; give that with --checkpoint PATH")
+            raise WeightsError(f"{directory}: built from {origin}; pass these weights with --checkpoint PATH")
         else:
             seed = int(random[1])
     elif seed is None and filled is not None:
@@ -137,38 +141,38 @@ def job_of(
     if found.sha256 != sha256:
         raise ArtifactError(
             f"{where}: calibration set {name} has sha256 {sha256[:12]}…, found {found.sha256[:12]}…; "
-            f"name the one it was built with by --calibration"
+            f"pass the set it was built with as --calibration"
         )
-    return Job(target, WeightSource(config, checkpoints, seed), found, asked), _notes(asked)
+    return Job(target, WeightSource(config, checkpoints, seed), found, request), _notes(request)
 
 
-def _asked(content: Mapping[str, Any]) -> Asked:
+def _request(content: Mapping[str, Any]) -> ExportRequest:
     settings = content["settings"]
     named = (content["target"], content["model"])
     if not isinstance(settings, list) or not all(isinstance(s, str) for s in settings):
         raise TypeError("asked.settings must be a list of texts")
     if not all(name is None or isinstance(name, str) for name in named):
         raise TypeError("asked.target and asked.model must be a name or null")
-    return Asked(*named, tuple(settings))
+    return ExportRequest(*named, tuple(settings))
 
 
-def _target_and_config(manifest: Mapping[str, Any], asked: Asked) -> tuple[Target, TicVlaConfig]:
+def _target_and_config(manifest: Mapping[str, Any], request: ExportRequest) -> tuple[Target, TicVlaConfig]:
     recorded = config_from_dict(manifest["model"]["config"])
     config = recorded
-    if asked.model is not None:
-        config = with_overrides(config_for(asked.model), model_settings(asked.settings))
-    # Read in any case: a manifest whose copy cannot be read is damaged.
+    if request.model is not None:
+        config = with_overrides(config_for(request.model), model_settings(request.settings))
+    # Parse the copy even if it is not used: an unreadable copy means a damaged manifest.
     target = parse_target(manifest["provenance"]["target"], "provenance.target")
-    if asked.target is not None:
-        if asked.target not in list_targets():
-            raise TargetError(f"target {asked.target!r} is not known")
-        target = with_settings(load_target(asked.target, config.name), asked.settings)
+    if request.target is not None:
+        if request.target not in list_targets():
+            raise TargetError(f"unknown target {request.target!r}")
+        target = with_settings(load_target(request.target, config.name), request.settings)
     return target, config
 
 
-def _notes(asked: Asked) -> list[str]:
-    """Where a directory is held to something else than what a shipped target asks for."""
-    if asked.target is None:
-        return ["note: built for a target file of its own; checked against the thresholds that the manifest gives"]
-    moved = [setting for setting in asked.settings if setting.strip().startswith("gates.")]
-    return [f"note: thresholds were set when it was built: {', '.join(moved)}"] if moved else []
+def _notes(request: ExportRequest) -> list[str]:
+    """Return notes about thresholds that differ from those of a shipped target."""
+    if request.target is None:
+        return ["note: built for the user's own target file; checked against the thresholds in the manifest"]
+    moved = [setting for setting in request.settings if setting.strip().startswith("gates.")]
+    return [f"note: thresholds were changed with --set for this build: {', '.join(moved)}"] if moved else []

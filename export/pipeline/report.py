@@ -1,4 +1,4 @@
-"""report.html: what was built, how exact it is, what it costs; made from report.json alone, so it can be made again."""
+"""Renders report.html (files, accuracy, cost) from report.json alone, so that it can be rendered again."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MARKS = {"PASS": "pass", "WARN": "warn", "FAIL": "fail"}
 
 
 def report_html(report: Report) -> str:
-    """The whole page; same report → same bytes."""
+    """Render the page; same report → same bytes."""
     graphs = {name: report["graphs"][name] for name in GRAPH_ORDER if name in report["graphs"]}
     report = {**report, "graphs": graphs}
     provenance, plan = report["provenance"], report["plan"]
@@ -68,7 +68,7 @@ def report_html(report: Report) -> str:
 
 
 def size_text(count: float) -> str:
-    """Bytes in the unit that fits: `1.2 GB`, `48 MB`, `3 kB`."""
+    """Format bytes: `1.2 GB`, `48 MB`, `3 kB`."""
     for unit, scale in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if count >= scale:
             return f"{count / scale:.3g} {unit}"
@@ -76,7 +76,7 @@ def size_text(count: float) -> str:
 
 
 def precision_text(precision: Mapping[str, Any]) -> str:
-    """Default precision and how many layer patterns differ from it."""
+    """Format the default precision and the number of layer patterns with another one."""
     overrides = precision["overrides"]
     extra = f" + {len(overrides)} exception{'s' if len(overrides) > 1 else ''}" if overrides else ""
     return f"{precision['default']}{extra}"
@@ -136,14 +136,14 @@ def _small(value: float) -> str:
 
 
 def _gate(report: Report, name: str) -> Mapping[str, Any]:
-    """Thresholds of a graph; the halves of a language model may share theirs."""
+    """Return the thresholds of a graph; both graphs of a language model may share theirs."""
     gates = report["provenance"]["target"]["gates"]
     found: Mapping[str, Any] = gates.get(name) or gates[name.partition(".")[0]]
     return found
 
 
 def _delay_plot(report: Report) -> list[Figure]:
-    """Task error over the age of the semantic state, of the graphs for which it was measured."""
+    """Plot the task error over the age of the semantic state, for the graphs with a measured one."""
     lines = [
         Line(
             f"{name} ({precision_text(graph['precision'])})", tuple(map(tuple, graph["parity"]["task"]["by_delay_cm"]))
@@ -158,14 +158,14 @@ def _delay_plot(report: Report) -> list[Figure]:
         Figure(
             line_plot(lines, x_label, y_label, _gate(report, "task")["waypoint_cm"]),
             f"{y_label} over {x_label}",
-            "What rounding one graph does to the planned path, the others exact: the worst moment's mean deviation "
-            "over the chunk, by how old the semantic state is. Measured on this directory's bytes.",
+            "Effect of rounding one graph on the planned path, all others exact: the worst moment's mean deviation "
+            "over the chunk, by age of the semantic state. Measured on this directory's bytes.",
         )
     ]
 
 
 def _layer_plots(report: Report) -> list[Figure]:
-    """For every graph that was searched: its most sensitive groups of layers, each rounded alone."""
+    """Plot the most sensitive groups of layers, each rounded alone, for every graph that was searched."""
     plots = []
     for name, decision in report["sensitivity"].items():
         rows = [row for row in decision["table"] if row["group"] != "*"]
@@ -174,7 +174,7 @@ def _layer_plots(report: Report) -> list[Figure]:
         raised = set(decision["precision"]["overrides"])
         dots = [Dot(row["group"], row["waypoint_cm"], row["group"] in raised) for row in rows[:LAYERS_SHOWN]]
         more = f" of {len(rows)}" if len(rows) > LAYERS_SHOWN else ""
-        kept = ", filled: kept more exact" if raised else ""
+        kept = ", filled: raised to a more exact precision" if raised else ""
         plots.append(
             Figure(
                 dot_plot(dots, "worst waypoint error in cm", _gate(report, "task")["waypoint_cm"]),
@@ -187,16 +187,16 @@ def _layer_plots(report: Report) -> list[Figure]:
 
 
 PLAN_ROWS = (
-    ("tick_alone_ms", "tick, nothing beside it", "ms"),
-    ("tick_ms", "tick with reasoning beside it", "ms"),
+    ("tick_alone_ms", "tick without reasoning", "ms"),
+    ("tick_ms", "tick with reasoning", "ms"),
     ("period_ms", "tick period", "ms"),
-    ("generation_alone_ms", "generation, nothing beside it", "ms"),
-    ("generation_ms", "generation with control beside it", "ms"),
+    ("generation_alone_ms", "generation without control", "ms"),
+    ("generation_ms", "generation with control", "ms"),
     ("prompt_tokens", "prompt", "tokens"),
-    ("tokens", "new tokens a generation may have", "tokens"),
+    ("tokens", "largest number of new tokens of a generation", "tokens"),
     ("delay_s", "largest age of the semantic state", "s"),
     ("max_delay_s", "ceiling on that age", "s"),
-    ("duty", "share of the time left by control in which reasoning may run", ""),
+    ("duty", "largest share of reasoning in the time that control leaves", ""),
     ("average_w", "average power", "W"),
     ("budget_w", "power budget", "W"),
 )
@@ -215,7 +215,7 @@ def _plan_headline(plan: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _graph_time(plan: Mapping[str, Any], graph: str) -> tuple[str, str]:
-    """Milliseconds of the stages that a graph does, and their tag."""
+    """Return the time of a graph's stages, ms, and its tag."""
     stages = [stage for stage in plan["per_graph"].values() if stage["graph"] == graph]
     tags = sorted({stage["tagged"] for stage in stages})
     return " + ".join(f"{stage['ms']:,.3g} ms" for stage in stages), ", ".join(tags)

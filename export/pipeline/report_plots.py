@@ -10,12 +10,12 @@ from reporting.plot_style import BAD, COMMAND, GOOD, INK, PERSON, TRUTH, new_fig
 
 WIDTH_IN = 5.4
 _STYLES = tuple(zip((TRUTH, COMMAND, PERSON, GOOD, "#b8860b"), ("-", "--", ":", "-.", (0, (5, 5))), strict=True))
-"""Colour and dash of each line: the page may be printed in grey."""
+"""Colour and dash of each line; the dash distinguishes them in a grey print."""
 
 
 @dataclass(frozen=True)
 class Dot:
-    """One row of a dot plot; a marked one is drawn filled."""
+    """Row of a dot plot; a marked one is drawn filled."""
 
     label: str
     value: float
@@ -24,14 +24,14 @@ class Dot:
 
 @dataclass(frozen=True)
 class Line:
-    """One line of a line plot: (x, y) points in order of x."""
+    """Line of a line plot: (x, y) points in order of x."""
 
     label: str
     points: tuple[tuple[float, float], ...]
 
 
 def dot_plot(dots: Sequence[Dot], x_label: str, limit: float) -> bytes:
-    """Draw values on a logarithmic axis, one row each; a value of 0 lies on the left edge."""
+    """Draw values on a logarithmic axis, one row each; 0 is on the left edge."""
     figure = new_figure(WIDTH_IN, 0.9 + 0.25 * len(dots))
     axes = figure.add_subplot()
     values = [value for value in [*(dot.value for dot in dots), limit] if value > 0] or [1.0]
@@ -53,7 +53,7 @@ def dot_plot(dots: Sequence[Dot], x_label: str, limit: float) -> bytes:
 
 
 def line_plot(lines: Sequence[Line], x_label: str, y_label: str, limit: float) -> bytes:
-    """Draw lines from zero up. A limit above twice the largest value is only named, not drawn to scale."""
+    """Draw lines from zero up. A limit above twice the largest value appears in the legend only."""
     figure = new_figure(WIDTH_IN, 2.4 + 0.18 * len(lines))
     axes = figure.add_subplot()
     for index, line in enumerate(lines):
@@ -61,7 +61,7 @@ def line_plot(lines: Sequence[Line], x_label: str, y_label: str, limit: float) -
         axes.plot(*zip(*line.points, strict=True), color=colour, linestyle=dash, label=line.label)
     largest = max(y for line in lines for _, y in line.points)
     near = 0 < limit <= 2 * largest
-    # A line at infinity is not drawn, but has its name in the legend.
+    # A line at infinity is not visible, but its name is in the legend.
     axes.axhline(
         limit if near else math.nan,
         color=BAD,

@@ -1,1 +1,1 @@
-"""What fits a target: time, memory and power of a model on a device, modelled or measured."""
+"""Plan of a target: time, memory and power of a model on a device, modelled or measured."""

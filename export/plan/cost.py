@@ -1,4 +1,4 @@
-"""What every graph computes and moves, counted from the model's configuration: products, weights, caches."""
+"""Counts operations and bytes of every graph from the model's configuration: products, weights, caches."""
 
 from __future__ import annotations
 
@@ -15,51 +15,51 @@ PREFILL, DECODE = LANGUAGE_PAIR
 
 @dataclass(frozen=True)
 class Linear:
-    """A weight matrix [rows, columns] and the tokens that go through it in one call, all passes together."""
+    """Weight matrix [rows, columns] and the number of tokens it multiplies in one call, over all passes."""
 
     name: str
     rows: int
     columns: int
     tokens: int
     table: bool = False
-    """A lookup table: a call reads `tokens` of its rows and multiplies nothing."""
+    """Lookup table: a call reads `tokens` of its rows and multiplies nothing."""
     passes: int = 1
-    """Times that a call reads it: an unrolled loop goes through it again, with its share of the tokens each time."""
+    """Number of reads per call: an unrolled loop reads it in every pass, with a share of the tokens."""
 
     @property
     def flops(self) -> int:
-        """Floating-point operations of one call."""
+        """Return the floating-point operations of one call."""
         return 0 if self.table else FLOPS_PER_PRODUCT * self.rows * self.columns * self.tokens
 
     def bytes_in(self, precision: Precision, scale_bytes: int) -> int:
-        """Bytes that it takes in memory, where its scales and activations take `scale_bytes` each."""
+        """Return its bytes in memory; a scale or activation has `scale_bytes` bytes."""
         name = precision.of(self.name)
         if name == "fp16" and not self.table and scale_bytes == 4:
-            name = "fp32"  # widened when the graph is opened: a kernel multiplies equal types
+            name = "fp32"  # widened when the graph is opened, because kernels multiply equal types
         if self.table and name not in ("fp32", "fp16"):
-            name = "int8"  # tables are stored in 8 bits at least, one scale a row
+            name = "int8"  # tables have 8 bits or more and one scale per row
         return weight_bytes(name, self.rows, self.columns, scale_bytes=scale_bytes)
 
 
 @dataclass(frozen=True)
 class Call:
-    """One call of a graph."""
+    """Call of a graph."""
 
     linears: tuple[Linear, ...]
     attention_flops: int
     activations: int
-    """Numbers written and read again between operators."""
+    """Number of values written and read between operators."""
     cache: int
-    """Numbers of KV buffers or semantic context read and written."""
+    """Number of values of KV buffers or semantic context read and written."""
     workspace: int
-    """Numbers alive at once, at most."""
+    """Largest number of values in memory at once."""
 
     def flops(self) -> int:
-        """Floating-point operations."""
+        """Return the floating-point operations."""
         return sum(linear.flops for linear in self.linears) + self.attention_flops
 
     def linear_flops(self, precision: Precision) -> Mapping[str, int]:
-        """Operations of the weight products by precision."""
+        """Return the operations of the weight products by precision."""
         flops: dict[str, int] = {}
         for linear in self.linears:
             if linear.flops:
@@ -68,11 +68,11 @@ class Call:
         return flops
 
     def weights(self, precision: Precision, scale_bytes: int) -> int:
-        """Bytes of all weights: what the graph takes in memory."""
+        """Return the bytes of all weights in memory."""
         return sum(linear.bytes_in(precision, scale_bytes) for linear in self.linears)
 
     def traffic(self, precision: Precision, *, activation_bytes: int, cache_bytes: int) -> int:
-        """Bytes that one call moves: every weight once a pass (of a table only the rows used), activations, caches."""
+        """Return the bytes moved by one call: weights per pass (of a table only the used rows), activations, caches."""
         read = 0
         for linear in self.linears:
             stored = linear.passes * linear.bytes_in(precision, activation_bytes)
@@ -81,7 +81,7 @@ class Call:
 
 
 def vision_call(config: TicVlaConfig) -> Call:
-    """The encoder on one frame."""
+    """Count a call of the encoder on one frame."""
     c = config.vision
     patches, tokens = c.grid**2, c.grid**2 + 1
     embed: list[Linear] = []
@@ -117,7 +117,7 @@ def vision_call(config: TicVlaConfig) -> Call:
 
 
 def language_call(config: TicVlaConfig, graph: str, *, tokens: int, past: int) -> Call:
-    """The language model on `tokens` new tokens after `past` in the buffers; `graph` decides which parts it has."""
+    """Count a call of a language graph on `tokens` new tokens after `past` in the buffers."""
     c = config.language
     attended = c.heads * c.head_dim
     kv = c.kv_heads * c.head_dim
@@ -135,7 +135,7 @@ def language_call(config: TicVlaConfig, graph: str, *, tokens: int, past: int) -
             Linear(f"layers.{i}.down", c.hidden, c.mlp, tokens),
         ]
     if graph != PREFILL:
-        # Only the last position of a call is projected onto the vocabulary.
+        # Only a call's last position is projected onto the vocabulary.
         linears.append(Linear("lm_head", c.vocab, c.hidden, 1))
     width = 6 * c.hidden + 3 * c.mlp
     return Call(
@@ -148,7 +148,7 @@ def language_call(config: TicVlaConfig, graph: str, *, tokens: int, past: int) -
 
 
 def context_call(config: TicVlaConfig, *, tokens: int) -> Call:
-    """The semantic context of `tokens` tokens: once a generation, of waypoints once a tick."""
+    """Count the semantic context of `tokens` tokens: one call per generation, with waypoints one per tick."""
     c = config.action
     width = config.guidance_width
     linears = [
@@ -167,18 +167,18 @@ def context_call(config: TicVlaConfig, *, tokens: int) -> Call:
 
 
 def context_numbers(config: TicVlaConfig, tokens: int) -> int:
-    """Numbers of a semantic context: keys and values of every layer."""
+    """Return the number of values of a semantic context: keys and values of every layer."""
     return 2 * config.action.layers * tokens * config.action.hidden
 
 
 def action_call(config: TicVlaConfig, *, context: int) -> Call:
-    """One step of the action expert over a semantic context of `context` tokens, all passes of its head included."""
+    """Count one step of the action expert over `context` semantic tokens, including all passes of its head."""
     c, visual = config.action, config.vision.tokens
     now = visual + 2
     denoises = c.head == "diffusion"
     passes = c.ddim_steps if denoises else 1
     chunk = passes * c.steps
-    # A diffusion's tokens also attend to one another: they go through the layers' keys and values as well.
+    # A diffusion's tokens also attend to one another, so the layers compute their keys and values too.
     among = c.steps if denoises else 0
     linears = [
         Linear("visual_projection.0", c.hidden, config.vision.token_dim, visual),
@@ -220,7 +220,7 @@ def action_call(config: TicVlaConfig, *, context: int) -> Call:
 
 
 def _coupling_linears(config: TicVlaConfig) -> list[Linear]:
-    """Layers of a flow: of every coupling, one half of the steps is moved by the other."""
+    """Return the layers of a flow; each coupling maps half of the steps conditioned on the other half."""
     c = config.action
     linears = []
     for i in range(c.couplings):

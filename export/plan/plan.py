@@ -1,4 +1,4 @@
-"""What fits a target: tick, generation, tokens, duty, power and memory, from a model of the device; or why it does not.
+"""Plans tick, generation, tokens, duty, power and memory of a target from a model of the device.
 
 All numbers of the model are a target's figures or measured points:
 
@@ -46,12 +46,12 @@ LARGE_VOCABULARY = 100_000
 
 
 class PlanError(ValueError):
-    """A plan that cannot be made, or one that does not fit and must; its text is the one line to show."""
+    """Impossible plan, or plan that does not fit; its text is the one line to show."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Schedule of both threads on a target, and whether it fits."""
+    """Schedule of both threads on a target, with a verdict."""
 
     target: str
     model: str
@@ -61,21 +61,21 @@ class Plan:
     precisions: Mapping[str, Precision]
     tick_alone: Estimate
     tick: Estimate
-    """A tick with reasoning beside it."""
+    """Tick while reasoning runs."""
     generation_alone: Estimate
     generation: Estimate | None
-    """A generation with control beside it; None if control leaves it nothing."""
+    """Generation while control runs; None if control leaves no time."""
     work: Work
     duty: float
-    """Share of the time left by control in which reasoning may run."""
+    """Largest share of reasoning in the time that control leaves."""
     delay_s: float | None
-    """Largest age of the semantic state in use."""
+    """Largest age of the semantic state in use, s."""
     max_delay_s: float
     average_w: float | None
     average_w_error: float | None
     budget_w: float | None
     rise_w: float | None
-    """Power that a running stage adds to idle power, at most."""
+    """Largest power that a running stage adds to idle power, W."""
     memory: Memory
     weight_bytes: Mapping[str, int]
     reasons: tuple[str, ...]
@@ -83,26 +83,26 @@ class Plan:
 
     @property
     def fits(self) -> bool:
-        """Nothing is exceeded."""
+        """Whether no limit is exceeded."""
         return not self.reasons
 
     @property
     def tokens(self) -> int:
-        """New tokens that a generation may have."""
+        """Largest number of new tokens of a generation."""
         return self.work.new_tokens
 
     @property
     def tagged(self) -> str:
-        """`measured` if every stage was, else `modelled`."""
+        """`measured` if all stages were measured, else `modelled`."""
         return MEASURED if self.tick.tag == MEASURED and self.generation_alone.tag == MEASURED else MODELLED
 
     def require(self) -> None:
-        """Raise PlanError with one line unless the plan fits."""
+        """Raise PlanError with a one-line message unless the plan fits."""
         if self.reasons:
             raise PlanError(f"{self.model} does not fit {self.target} ({self.mode}): {'; '.join(self.reasons)}")
 
     def to_dict(self) -> dict[str, Any]:
-        """The manifest's `plan`: plain JSON, rounded so that it is the same everywhere."""
+        """Return the manifest's `plan`: plain JSON, rounded so that it is equal on every machine."""
         return {
             "fits": self.fits,
             "reasons": list(self.reasons),
@@ -148,7 +148,7 @@ class Plan:
         }
 
     def _energy_j(self, stage: StageTime) -> float | None:
-        """Energy of a stage as metered, else what a full load would add in its time; None: the target has no power."""
+        """Return a stage's metered energy, else that of full load over its time, J; None for a target without power."""
         if stage.energy_j is not None:
             return round(stage.energy_j, 4)
         return None if self.rise_w is None else round(self.rise_w * stage.whole.ms / 1e3, 4)
@@ -166,10 +166,10 @@ def plan(
     tokens: int | None = None,
     text_tokens: int | None = None,
 ) -> Plan:
-    """Size both threads of a model for a target (already `for_model`); pure: the same arguments give the same plan.
+    """Plan both threads of a model for a target (already `for_model`). Pure: same arguments → same plan.
 
-    `precisions` by graph replace the target's own; `tokens` fixes the new tokens of a generation, which are otherwise
-    the most that keep Δt under the target's ceiling. Raises PlanError for arguments that make no plan.
+    `precisions` by graph replace the target's; `tokens` fixes the new tokens of a generation, by default the largest
+    number that keeps Δt under the target's ceiling. Raises PlanError for impossible arguments.
     """
     wanted = dict(precisions or {})
     unknown = sorted(set(wanted) - set(target.graphs))
@@ -194,7 +194,7 @@ def plan(
     if tokens is not None:
         return _sized(target, config, chosen, prompt, tokens, advise=True)
     low, high = 0, min(target.runtime.max_new_tokens, room)
-    while low < high:  # Δt grows with the tokens, so the most that keep it under its ceiling are found by halving
+    while low < high:  # Δt grows with the tokens: bisect for the largest number under the ceiling
         middle = (low + high + 1) // 2
         delay_s = _sized(target, config, chosen, prompt, middle, advise=False).delay_s
         low, high = (
@@ -204,7 +204,7 @@ def plan(
 
 
 def _check_profiles(target: Target, config: TicVlaConfig) -> None:
-    """Refuse engines that the model's context would outgrow: a call beyond a profile fails while the robot walks."""
+    """Refuse profiles shorter than the model's context: a longer call would fail while the robot walks."""
     context = config.language.max_context
     needed = {"T": (config.frame_tokens, context), "S": (1, min(target.runtime.prefill_chunk_tokens, context))}
     needed["C"] = (context, context)
@@ -222,14 +222,14 @@ def _check_profiles(target: Target, config: TicVlaConfig) -> None:
 
 @dataclass(frozen=True)
 class _Share:
-    """How the device's time is divided."""
+    """Division of the device's time between control and reasoning."""
 
     control: float
-    """Share of the time in which control runs."""
+    """Share of control."""
     left: float
-    """Share that reasoning could have."""
+    """Share available to reasoning."""
     reasoning: float
-    """Share that it may have under the power budget."""
+    """Share of reasoning under the power budget."""
     average_w: float | None
     error: float | None
 
@@ -239,7 +239,7 @@ def _share(target: Target, tick_alone_ms: float) -> _Share:
     control = tick_alone_ms / target.runtime.tick_period_ms
     one_device = target.roofline.sharing == "one-device"
     left = max(0.0, 1.0 - control) if one_device else 1.0
-    # On cores of their own, each thread loads its part of the processor.
+    # With separate cores, each thread loads its part of the processor.
     control_load, reasoning_load = (
         (1.0, 1.0) if one_device else (_load(target, TICK_STAGES), _load(target, ("decode",)))
     )
@@ -346,7 +346,7 @@ def _reasons(target: Target, made: Plan, share: _Share) -> list[str]:
         reasons.append("the power budget leaves no time for reasoning after control: raise power.budget_w")
     if made.delay_s is not None and made.delay_s > made.max_delay_s:
         reasons.append(
-            f"with {made.tokens} new tokens a semantic state gets {made.delay_s:.1f} s old, the ceiling is "
+            f"with {made.tokens} new tokens a semantic state becomes {made.delay_s:.1f} s old, the ceiling is "
             f"{made.max_delay_s:g} s: allow fewer tokens, frames or more power, or set runtime.max_delay_s"
         )
     memory = made.memory
@@ -375,7 +375,7 @@ def _warnings(target: Target, made: Plan, reasons: Sequence[str]) -> list[str]:
 def _modes_that_fit(
     target: Target, config: TicVlaConfig, chosen: Mapping[str, Precision], prompt: int, tokens: int
 ) -> list[str]:
-    """Other power modes under which nothing would be exceeded."""
+    """Return the other power modes in which the plan would fit."""
 
     def fits(name: str) -> bool:
         other = dataclasses.replace(target, power=dataclasses.replace(target.power, mode=name))

@@ -1,4 +1,4 @@
-"""A plan for a person: one table of stages, then what it adds up to and what it exceeds."""
+"""Prints a plan: a table of stages, sums, exceeded limits."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from export.quantize.precision import Precision
 
 
 def plan_table(plan: Plan) -> RenderableType:
-    """Stages, sums and verdict; print it on a Console of standard error."""
+    """Return a table of stages with sums and verdict, for a Console on standard error."""
     title = f"{plan.model} on {plan.target}, power mode {plan.mode}"
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, show_edge=False, pad_edge=False)
     # Fits 80 columns; calls, products and bytes moved are in the JSON and in the report.
@@ -33,7 +33,7 @@ def plan_table(plan: Plan) -> RenderableType:
 
 
 def plan_lines(plan: Plan) -> list[str]:
-    """What a plan adds up to, one line each, the verdict last."""
+    """Return the sums of a plan, one per line, with the verdict last."""
     lines = [f"tick        {_time(plan.tick)} of {plan.period_ms} ms ({_time(plan.tick_alone)} without reasoning)"]
     if plan.generation is not None and plan.delay_s is not None:
         lines += [

@@ -1,4 +1,4 @@
-"""Time of every stage (measured if it was, else the roofline of its products and bytes) and memory of all of them."""
+"""Time of every stage (measured, else the roofline of its products and bytes) and memory of all stages."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ GIB = 1 << 30
 TICK_STAGES = ("vision_encoder", "action_expert")
 GENERATION_STAGES = ("prefill", "decode", "semantic_context")
 SAME_LENGTH = 0.05
-"""A measurement at a length within this share of the wanted one stands for it; else it only scales the model."""
+"""Largest relative difference in length at which a measurement is used directly; beyond it, it scales the model."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A time in ms with its error bar, where one is known, and whether it was measured."""
+    """Time in ms with its error bar, if known, and whether it was measured."""
 
     ms: float
     error: float | None
@@ -47,7 +47,7 @@ class Estimate:
         return self.ms * (1 + (self.error or 0.0))
 
     def times(self, factor: float, figure: Figure | None = None) -> Estimate:
-        """The estimate multiplied, also by a figure with an error of its own: other than 1, it makes it modelled."""
+        """Multiply the estimate by a factor, with its error; a factor other than 1 makes it modelled."""
         if figure is None:
             return replace(self, ms=self.ms * factor)
         value = figure.value
@@ -56,7 +56,7 @@ class Estimate:
 
 
 def total(parts: Sequence[Estimate]) -> Estimate:
-    """Sum of estimates; errors add up, because the model errs on all parts of a device alike."""
+    """Sum estimates; errors add up, because the model errs in the same direction on all parts."""
     ms = sum(part.ms for part in parts)
     known = [part for part in parts if part.error is not None]
     error = sum(part.ms * (part.error or 0.0) for part in parts) / ms if known and ms else None
@@ -66,25 +66,25 @@ def total(parts: Sequence[Estimate]) -> Estimate:
 
 @dataclass(frozen=True)
 class StageTime:
-    """One stage of a tick or a generation: calls of one graph."""
+    """Stage of a tick or a generation: calls of one graph."""
 
     stage: str
     graph: str
     calls: int
     each: Estimate
-    """The longest of its calls."""
+    """Longest call, ms."""
     whole: Estimate
     flops: int
     moved_bytes: int
     bound: str
-    """What limits it: `compute`, `memory` or `measured`."""
+    """Limit of its time: `compute`, `memory` or `measured`."""
     energy_j: float | None = None
-    """Energy above idle of all its calls as metered, at other lengths in proportion to time; None: not metered."""
+    """Metered energy of all its calls above idle, J, at other lengths in proportion to time; None: not metered."""
 
 
 @dataclass(frozen=True)
 class Work:
-    """Lengths that a plan is made for."""
+    """Token counts of a plan."""
 
     prompt_tokens: int
     chunk_tokens: int
@@ -92,18 +92,18 @@ class Work:
 
     @property
     def chunks(self) -> list[tuple[int, int]]:
-        """(tokens, tokens before) of every prefill call."""
+        """(tokens, preceding tokens) of every prefill call."""
         starts = range(0, self.prompt_tokens, self.chunk_tokens)
         return [(min(self.chunk_tokens, self.prompt_tokens - start), start) for start in starts]
 
     @property
     def context_tokens(self) -> int:
-        """Tokens in the semantic state."""
+        """Tokens of the semantic state."""
         return self.prompt_tokens + self.new_tokens
 
 
 def stage_graph(target: Target, stage: str) -> str:
-    """The graph of a stage."""
+    """Return the graph of a stage."""
     pair = {"prefill": PREFILL, "decode": DECODE}
     if stage in pair and LANGUAGE_WHOLE[0] in target.graphs:
         return LANGUAGE_WHOLE[0]
@@ -111,7 +111,7 @@ def stage_graph(target: Target, stage: str) -> str:
 
 
 def stage_calls(config: TicVlaConfig, graph: str, stage: str, work: Work) -> list[tuple[Call, int]]:
-    """(call, how often) of a stage; decoding is taken at its middle length."""
+    """Return (call, count) of a stage; decoding is counted at its middle length."""
     if stage == "vision_encoder":
         return [(vision_call(config), 1)]
     if stage == "prefill":
@@ -125,7 +125,7 @@ def stage_calls(config: TicVlaConfig, graph: str, stage: str, work: Work) -> lis
 
 
 def stage_time(target: Target, config: TicVlaConfig, stage: str, precision: Precision, work: Work) -> StageTime:
-    """Time of a stage's calls with nothing else running."""
+    """Estimate the time of a stage's calls while nothing else runs."""
     graph = stage_graph(target, stage)
     modelled = _modelled(target, config, stage, precision, work)
     point = _point(target, config.name, graph, stage, precision)
@@ -137,11 +137,11 @@ def stage_time(target: Target, config: TicVlaConfig, stage: str, precision: Prec
     per = calls if stage == "decode" else 1  # a decode point is per token, any other for the whole stage
     where = f"measured on {point.machine}, {point.date}"
     same_chunks = point.chunk_tokens is None or point.chunk_tokens == work.chunk_tokens
-    # Points name a model, and its action expert was measured with the query head.
+    # A point names a model; its action expert was measured with the query head.
     timed = replace(config, action=replace(config.action, head="query")) if stage == "action_expert" else config
     if (taken is None or abs(wanted - taken) <= SAME_LENGTH * taken) and same_chunks and timed == config:
         whole = Estimate(measured_ms * per, point.error, MEASURED, where)
-        # Only the whole was measured: its longest call is the model's share of it.
+        # Only the total was measured: the longest call is estimated from the model's share.
         share = modelled.each.ms / modelled.whole.ms if modelled.whole.ms else 1.0
         energy_j = None if point.energy_j is None else point.energy_j * per
         return replace(modelled, whole=whole, each=whole.times(share), bound=MEASURED, energy_j=energy_j)
@@ -167,7 +167,7 @@ def _length(stage: str, work: Work) -> int:
 
 
 def _at(stage: str, work: Work, point: Measured) -> Work:
-    """The lengths that a measurement was taken at."""
+    """Return the token counts of a measurement."""
     tokens = point.tokens or _length(stage, work)
     if stage == "prefill":
         return Work(tokens, point.chunk_tokens or work.chunk_tokens, 0)
@@ -175,10 +175,10 @@ def _at(stage: str, work: Work, point: Measured) -> Work:
 
 
 def _point(target: Target, model: str, graph: str, stage: str, precision: Precision) -> Measured | None:
-    """The newest measurement of exactly this, the last one listed among equals."""
+    """Find the newest measurement with these properties; of equal dates the last one listed."""
     policy = target.graphs[graph]
     threads = policy.threads or 1
-    # The unit of a whole language model's point tells prefill (ms) from decoding (tokens/s).
+    # The unit of a language model's point distinguishes prefill (ms) from decoding (tokens/s).
     per_token = {"prefill": False, "decode": True}.get(stage)
     found = [
         point
@@ -221,7 +221,7 @@ def _modelled(target: Target, config: TicVlaConfig, stage: str, precision: Preci
 def _call_ms(
     target: Target, graph: str, stage: str, call: Call, precision: Precision
 ) -> tuple[float, float | None, str]:
-    """Time of one call in ms, its relative error, and what bounds it."""
+    """Estimate the time of one call: ms, relative error, and the bounding resource."""
     provider, roofline, mode = target.provider(graph), target.roofline, target.power.selected
     efficiency = roofline.compute_efficiency[stage]
     cores = 1.0  # share of the processor
@@ -230,7 +230,7 @@ def _call_ms(
     work = [(provider.compute.attention, call.attention_flops)]
     for name, flops in call.linear_flops(precision).items():
         roof = provider.compute.roof(name)
-        # A precision without a kernel of its own is expanded and computed in fp32.
+        # A precision without a kernel is expanded and computed in fp32.
         work.append((roof or provider.compute.fp32 or "fp32", flops))
     compute_ms = sum(
         flops / (roofline.peak(roof).value * 1e9 * mode.compute.value * efficiency.value * cores) * 1e3
@@ -240,7 +240,7 @@ def _call_ms(
         precision, activation_bytes=provider.activation_bytes, cache_bytes=KV_DTYPES[target.runtime.kv_dtype]
     )
     bandwidth = roofline.memory_gbps.value * 1e9 * mode.memory.value * roofline.memory_efficiency.value
-    # One core does not saturate the memory bus of a processor; two nearly do.
+    # One core does not saturate a processor's memory bus; two nearly do.
     memory_ms = moved / (bandwidth * cores) * 1e3
     overhead = provider.call_overhead_ms
     if compute_ms >= memory_ms:
@@ -255,14 +255,14 @@ def _call_ms(
 
 
 def _together(*errors: float | None) -> float | None:
-    """Independent relative errors of factors."""
+    """Combine independent relative errors of factors."""
     known = [error for error in errors if error is not None]
     return math.sqrt(sum(error**2 for error in known)) if known else None
 
 
 @dataclass(frozen=True)
 class Memory:
-    """Bytes on the device that the model takes, by what for, and what there is for it."""
+    """Device memory of the model by purpose, and available memory, bytes."""
 
     weights: int
     caches: int
@@ -272,23 +272,23 @@ class Memory:
 
     @property
     def needed(self) -> int:
-        """Sum of what it takes."""
+        """Sum of the model's memory, bytes."""
         return self.weights + self.caches + self.activations + self.workspace
 
 
 def graph_weights(target: Target, config: TicVlaConfig, graph: str, precision: Precision, work: Work) -> int:
-    """Bytes of a graph's weights."""
+    """Return the bytes of a graph's weights."""
     stage = {"language_model": "prefill", "language_model.prefill": "prefill", "language_model.decode": "decode"}
     call = stage_calls(config, graph, stage.get(graph, graph), work)[0][0]
     return call.weights(precision, target.provider(graph).activation_bytes)
 
 
 def memory_of(target: Target, config: TicVlaConfig, work: Work, weights: int) -> Memory:
-    """What a model whose weights take `weights` bytes needs on the target's device."""
+    """Estimate the device memory of a model with `weights` bytes of weights."""
     language = config.language
     kv_bytes = KV_DTYPES[target.runtime.kv_dtype]
     caches = 2 * language.layers * language.kv_heads * language.head_dim * language.max_context
-    # The context in use and the next one; the ring of encoded frames is kept in fp32.
+    # The context in use and the next one; encoded frames are in fp32.
     contexts = 2 * context_numbers(config, work.context_tokens)
     frames = (len(target.runtime.frame_offsets_s) + 1) * config.vision.tokens * config.vision.token_dim * 4
     activations = max(
@@ -319,9 +319,9 @@ def measured_point(
     date: str,
     energy_j: float | None = None,
 ) -> Measured:
-    """The point of one stage: `samples` has its times in ms (decode: of a token), and `prompt` and `new` tokens.
+    """Build the point of one stage from `samples`, its times in ms (decode: per token), at `prompt` and `new` tokens.
 
-    `energy_j` is the energy above idle of one such time. Raises TargetError for a time that is no time.
+    `energy_j` is the energy above idle of one such time. Raises TargetError for an invalid time.
     """
     graph = stage_graph(target, stage)
     policy, times_ms = target.graphs[graph], samples[stage]
@@ -345,7 +345,7 @@ def measured_point(
         chunk_tokens=artifacts.runtime.prefill_chunk_tokens if stage == "prefill" else None,
         threads=threads if target.providers[policy.provider].uses_cores else None,
         mode=target.power.mode,
-        # Half the spread of the samples: what a repetition may differ by, not what another machine does.
+        # Half the spread of the samples: the error of a repetition on this machine, not of another machine.
         error=round(min(0.99, (max(times_ms) - min(times_ms)) / 2 / median_ms), 3),
         energy_j=None if energy_j is None else round(energy_j, 6),
     )

@@ -1,1 +1,1 @@
-"""Rounding of weights and activations: precision by layer, layouts, and its effect on the torch model."""
+"""Rounding of weights and activations: precision by layer, layouts, and the rounded PyTorch model."""

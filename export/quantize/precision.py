@@ -1,4 +1,4 @@
-"""Precision of a graph's weights: one default and, by layer name, what differs from it."""
+"""Precision of a graph's weights: a default and exceptions by layer name."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ PRECISIONS = ("fp32", "fp16", "int8-b32", "int8-b128", "int8", "int4-b32", "int4
 
 
 class PrecisionError(ValueError):
-    """A precision that is not one of PRECISIONS, or an override that addresses no layer."""
+    """Unknown precision, or override without a matching layer."""
 
 
 @dataclass(frozen=True)
@@ -27,16 +27,16 @@ class Precision:
                 raise PrecisionError(f"precision {name!r} is not known; expected one of: {', '.join(PRECISIONS)}")
 
     def of(self, layer: str) -> str:
-        """Precision of the layer of that name, e.g. `layers.3.down` or `lm_head`."""
+        """Return the precision of a layer, such as `layers.3.down` or `lm_head`."""
         return next((precision for pattern, precision in self.overrides if fnmatchcase(layer, pattern)), self.default)
 
     def to_dict(self) -> dict[str, object]:
-        """Plain JSON form."""
+        """Return the plain JSON form."""
         return {"default": self.default, "overrides": dict(self.overrides)}
 
     @classmethod
     def from_dict(cls, content: Mapping[str, object]) -> Precision:
-        """Inverse of `to_dict`; raises PrecisionError."""
+        """Build the precision from its `to_dict` form. Raises PrecisionError."""
         overrides = content.get("overrides", {})
         if set(content) - {"default", "overrides"} or not isinstance(overrides, Mapping):
             raise PrecisionError(f"precision must be 'default' and 'overrides', found {sorted(content)}")
@@ -44,17 +44,17 @@ class Precision:
 
 
 def block_size(precision: str) -> int | None:
-    """Weights that share one scale in a weight-only precision; None for the others."""
+    """Return the number of weights per scale of a weight-only precision; None for others."""
     return int(precision.partition("-b")[2]) if "-b" in precision else None
 
 
 def bits(precision: str) -> int:
-    """Bits that one weight takes, without its share of the scales."""
+    """Return the bits of one weight, without scales."""
     return {"fp32": 32, "fp16": 16}.get(precision) or int(precision.removeprefix("int").partition("-")[0])
 
 
 def weight_bytes(precision: str, rows: int, columns: int, *, scale_bytes: int = 4) -> int:
-    """Bytes of a [rows, columns] weight in a precision, its scales included."""
+    """Return the bytes of a [rows, columns] weight in a precision, including scales."""
     block = block_size(precision)
     if block is not None:
         blocks = -(-columns // block)

@@ -1,7 +1,7 @@
-"""Rounding of weights in ONNX Runtime's layouts, and parts of the torch model run as if their weights were rounded.
+"""Rounds weights in ONNX Runtime's layouts, and runs parts of the PyTorch model with rounded weights.
 
-A layer's weight is replaced only while that layer computes, by hooks: nothing is copied but the layer at work, and the
-model holds its own tensors again whenever no layer is running.
+Hooks replace a layer's weight only while that layer computes: only one layer is copied at a time, and the model has its
+original tensors otherwise.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Floats = npt.NDArray[np.float32]
 Linear = (nn.Linear, nn.Conv2d, nn.Embedding)
 SLAB_ROWS = 8192
 SHRINKS = (1.0, 0.95, 0.9, 0.85, 0.8)
-"""Factors tried on a 4-bit block's scale: clipping its largest weight a little often costs less than coarse steps."""
+"""Factors tried on a 4-bit block's scale: clipping its largest weight slightly is often better than coarse steps."""
 
 QUANTISED_ROWS = 4096
 
@@ -38,7 +38,7 @@ class Channels:
     scales: Floats
 
     def dequantised(self) -> Floats:
-        """The weights that the kernel multiplies with."""
+        """Return the dequantised weights, as the kernel uses them."""
         return self.values.astype(np.float32) * self.scales[:, None]
 
 
@@ -52,7 +52,7 @@ class Blocks:
     bits: int
 
     def dequantised(self) -> Floats:
-        """The weights that the kernel multiplies with, [out, in]."""
+        """Return the dequantised weights [out, in], as the kernel uses them."""
         rows = self.packed.shape[0]
         if self.bits == 4:
             codes = np.stack([self.packed & 15, self.packed >> 4], axis=-1).reshape(rows, self.packed.shape[1], -1)
@@ -75,7 +75,7 @@ def quantise_blocks(weight: Floats, precision: str) -> Blocks:
     block, width = block_size(precision), bits(precision)
     if block is None:
         raise ValueError(f"{precision!r} is not a block precision")
-    # In slabs of rows: the search below holds several copies of what it works on.
+    # In slabs of rows, because the search below makes several copies.
     slabs = [
         _quantise_slab(weight[i : i + QUANTISED_ROWS], block, width) for i in range(0, len(weight), QUANTISED_ROWS)
     ]
@@ -122,7 +122,7 @@ def _error(x: Floats, codes: Floats, scale: Floats) -> Floats:
 
 
 class Rounder:
-    """Rounds weights once and keeps the packed results of at most `keep_bytes`, the oldest leaving first."""
+    """Rounds weights and caches the packed results, at most `keep_bytes`; the oldest are dropped first."""
 
     def __init__(self, keep_bytes: int = 700_000_000) -> None:
         self._keep_bytes = keep_bytes
@@ -130,7 +130,7 @@ class Rounder:
         self._bytes = 0
 
     def weight(self, parameter: nn.Parameter, precision: str) -> Tensor:
-        """The parameter [out, …] as a kernel of that precision sees it."""
+        """Return a parameter [out, …] with the values of a precision's kernel."""
         return self._rows(parameter, precision, 0, parameter.shape[0])
 
     def _rows(self, parameter: nn.Parameter, precision: str, start: int, stop: int) -> Tensor:
@@ -139,7 +139,7 @@ class Rounder:
             return rows
         if precision == "fp16":
             return rows.half().float()
-        # By identity: the search holds the model, so an id cannot come to mean another parameter.
+        # By identity: the search keeps the model alive, so an id always means the same parameter.
         key = (id(parameter), precision, start)
         packed = self._kept.get(key)
         if packed is None:
@@ -149,11 +149,11 @@ class Rounder:
         return torch.from_numpy(packed.dequantised()).reshape(rows.shape)
 
     def choices(self, parameter: nn.Parameter, hidden: Tensor, precision: str) -> Tensor:
-        """Most likely token [n] of hidden states [n, d] by a vocabulary matrix; see `logits`."""
+        """Return the most likely token [n] of hidden states [n, d]; see `logits`."""
         return self.logits(parameter, hidden, precision).argmax(dim=-1)
 
     def logits(self, parameter: nn.Parameter, hidden: Tensor, precision: str) -> Tensor:
-        """Scores [n, vocab] of hidden states [n, d] by a vocabulary matrix, which is rounded slab by slab."""
+        """Compute scores [n, vocab] of hidden states [n, d] with a vocabulary matrix that is rounded slab by slab."""
         x = round_u8(hidden) if precision == "int8" else hidden
         starts = range(0, parameter.shape[0], SLAB_ROWS)
         return torch.cat(
@@ -176,10 +176,10 @@ class Rounder:
     def applied(
         self, part: nn.Module, precision: Precision, layers: Collection[str], *, activations: bool = True
     ) -> Iterator[None]:
-        """While active, every linear layer inside `part` that `layers` names computes in its precision.
+        """Make every linear layer of `part` that `layers` names compute in its precision within this context.
 
         With `activations`, `int8` layers also get their input rounded to 8 bits with one range a call, as the dynamic
-        kernels do, and `fp16` layers get theirs in 16 bits. The model is as before afterwards, also on an error.
+        kernels do, and `fp16` layers get theirs in 16 bits. The model is restored on exit, also after an error.
         """
         handles = []
         originals: list[tuple[nn.Parameter, Tensor]] = []
@@ -202,7 +202,7 @@ class Rounder:
         assert isinstance(parameter, nn.Parameter)
         original = parameter.data
         if isinstance(module, nn.Embedding):
-            # Only the rows that were looked up are rounded: the table is as large as the rest of the language model.
+            # Round only the looked-up rows: the table is as large as the rest of the language model.
             return [module.register_forward_hook(lambda _module, _inputs, rows: _table_rows(rows, precision))]
 
         def before(_module: nn.Module, inputs: tuple[Tensor, ...]) -> tuple[Tensor, ...] | None:
@@ -220,7 +220,7 @@ class Rounder:
 
 
 def round_u8(x: Tensor) -> Tensor:
-    """x rounded to 256 steps between its smallest and largest value, zero among them (`DynamicQuantizeLinear`)."""
+    """Round x to 256 steps between its smallest and largest value, including zero (`DynamicQuantizeLinear`)."""
     low, high = float(x.min().clamp(max=0)), float(x.max().clamp(min=0))
     if high == low:
         return x
@@ -230,7 +230,7 @@ def round_u8(x: Tensor) -> Tensor:
 
 
 def _table_rows(rows: Tensor, precision: str) -> Tensor:
-    """Looked-up rows of an embedding table, which is stored in 16 bits or in 8 bits with one scale a row."""
+    """Return looked-up rows of an embedding table stored in 16 bits, or in 8 bits with one scale per row."""
     if precision == "fp16":
         return rows.half().float()
     flat = rows.reshape(-1, rows.shape[-1]).numpy()
@@ -243,7 +243,7 @@ def _bytes(packed: Blocks | Channels) -> int:
 
 
 def activation_ranges(vision: VisionEncoder, frames: Sequence[npt.NDArray[np.uint8]]) -> dict[str, float]:
-    """Largest magnitude at the input of every linear layer over frames [1, px, px, 3], by the layer's name."""
+    """Return layer name → largest magnitude at its input over frames [1, px, px, 3]."""
     largest: dict[str, float] = {}
 
     def watch(name: str) -> Any:

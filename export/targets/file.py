@@ -1,4 +1,4 @@
-"""Targets are data: `export/targets/*.toml`, or a user's own file of the same shape."""
+"""Targets as data: `export/targets/*.toml`, or a user's file with the same tables."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ TARGETS_DIR = Path(__file__).parent
 TASK_GATE = "task"
 OTHER_GRAPHS = ("vision_encoder", "semantic_context", "action_expert")
 CHOOSING = (*LANGUAGE_WHOLE, LANGUAGE_PAIR[1])
-"""Graphs that choose a token."""
+"""Graphs with a next token."""
 MODEL_SECTIONS = ("graphs", "gates", "runtime")
 LEAVES = ("overrides", "profile", "options", "requires")
-"""Tables whose keys may hold dots: layer patterns and option names."""
+"""Tables whose keys may contain dots: layer patterns and option names."""
 FIXED_KEYS = ("schema", "name", "measured", "models")
 
 
 def graph_names(*, pair: bool) -> tuple[str, ...]:
-    """Names of a directory's graphs in the order in which they are built, with one language model or with a pair."""
+    """Return the graphs' names in build order, with one language model or with a pair."""
     return ("vision_encoder", *(LANGUAGE_PAIR if pair else LANGUAGE_WHOLE), "semantic_context", "action_expert")
 
 
 @dataclass(frozen=True)
 class Target:
-    """A device to export for."""
+    """Device to export for."""
 
     name: str
     description: str
@@ -59,7 +59,7 @@ class Target:
     runtime: RuntimePolicy
     measured: tuple[Measured, ...] = ()
     models: Mapping[str, Any] = field(default_factory=dict)
-    """Model name → what is different for it (tables of graphs, gates, runtime); see `for_model`."""
+    """Model name → its differing tables of graphs, gates and runtime; see `for_model`."""
 
     def __post_init__(self) -> None:
         names = set(self.graphs)
@@ -101,24 +101,24 @@ class Target:
 
     @property
     def graph_names(self) -> tuple[str, ...]:
-        """Names of the graphs in the order in which they are built."""
+        """Names of the graphs in build order."""
         return graph_names(pair=LANGUAGE_WHOLE[0] not in self.graphs)
 
     @property
     def half(self) -> bool:
-        """Activations and KV buffers are in fp16."""
+        """Whether activations and KV buffers are fp16."""
         return self.runtime.kv_dtype == "fp16"
 
     def provider(self, graph: str) -> Provider:
-        """Execution provider of a graph."""
+        """Return the execution provider of a graph."""
         return self.providers[self.graphs[graph].provider]
 
     def precision(self, graph: str) -> Precision:
-        """Precision of every layer of a graph as the target asks for it."""
+        """Return the target's precision of every layer of a graph."""
         return self.graphs[graph].precisions()
 
     def gate(self, graph: str) -> GraphGate:
-        """Thresholds of a graph; a half of the language model without its own takes those of `language_model`."""
+        """Return the thresholds of a graph; `language_model` is the default for both graphs of a pair."""
         found = self.gates.get(graph)
         if found is None and graph in LANGUAGE_PAIR:
             found = self.gates.get(LANGUAGE_WHOLE[0])
@@ -129,8 +129,10 @@ class Target:
         return found
 
     def session(self, graph: str, inputs: Sequence[Mapping[str, object]]) -> dict[str, Any]:
-        """The manifest's `session` of a graph with these inputs (name, shape); raises TargetError for a free axis
-        that an engine is built for without a profile."""
+        """Return the manifest's `session` of a graph with these inputs (name, shape).
+
+        Raises TargetError if an engine needs a profile of a free axis and has none.
+        """
         policy, provider = self.graphs[graph], self.provider(graph)
         options = dict(provider.options)
         if provider.engine:
@@ -145,7 +147,7 @@ class Target:
 
 
 def _profile_options(graph: str, policy: GraphPolicy, inputs: Sequence[Mapping[str, Any]]) -> dict[str, str]:
-    """TensorRT's explicit profiles: without them an engine would be rebuilt at run time for every new shape."""
+    """Return TensorRT's explicit profiles; without them it rebuilds the engine at run time for every new shape."""
     shapes: dict[str, list[str]] = {"min": [], "opt": [], "max": []}
     for tensor in inputs:
         free = [axis for axis in tensor["shape"] if isinstance(axis, str)]
@@ -160,12 +162,12 @@ def _profile_options(graph: str, policy: GraphPolicy, inputs: Sequence[Mapping[s
 
 
 def list_targets() -> list[str]:
-    """Names of the targets there are."""
+    """Return the names of the shipped targets."""
     return sorted(path.stem for path in TARGETS_DIR.glob("*.toml"))
 
 
 def load_target(name: str, model: str | None = None) -> Target:
-    """Read a target by name or by the path of a TOML file, for a model if one is named; raises TargetError."""
+    """Read a target by name or by the path of a TOML file, for a model if given. Raises TargetError."""
     own = name.endswith(".toml") or "/" in name
     if not own and name not in list_targets():
         names = ", ".join(list_targets())
@@ -203,7 +205,7 @@ def parse_target(content: Mapping[str, object], where: str) -> Target:
 
 
 def for_model(target: Target, model: str, where: str | None = None) -> Target:
-    """The target with what its file (`where` in errors) changes for that model; raises TargetError."""
+    """Apply the changes that the target's file (`where` in errors) makes for a model. Raises TargetError."""
     changes = target.models.get(model)
     base = {**target.to_dict(), "models": {}}
     if changes is None:
@@ -226,7 +228,7 @@ def _merged(base: Mapping[str, object], changes: Mapping[str, object]) -> dict[s
     merged = dict(base)
     for key, value in changes.items():
         below = merged.get(key)
-        # A list of overrides or candidates belongs to its precision: replaced, never mixed.
+        # A list of overrides or candidates belongs to its precision: replace it, never merge it.
         if isinstance(value, Mapping) and isinstance(below, Mapping) and key not in ("overrides", "profile"):
             merged[key] = _merged(below, value)
         else:
@@ -235,9 +237,9 @@ def _merged(base: Mapping[str, object], changes: Mapping[str, object]) -> dict[s
 
 
 def with_settings(target: Target, settings: Iterable[str]) -> Target:
-    """The target with `key=value` settings (`--set`), typed by the field; raises TargetError naming near keys.
+    """Apply `key=value` settings (`--set`) with the fields' types. Raises TargetError that names similar keys.
 
-    Settings of the network (`model.…`) are left out. A graph's precision also ends the search for a better one.
+    Settings of the network (`model.…`) are ignored. Setting a graph's precision disables the search for it.
     """
     content = target.to_dict()
     for setting in _expanded(settings):
@@ -262,7 +264,7 @@ def _expanded(settings: Iterable[str]) -> Iterator[str]:
 
 
 def _places(content: Mapping[str, Any], parts: list[str]) -> list[list[str]]:
-    """What a dotted path names; `language_model` means both halves where there is a pair."""
+    """Return the key paths of a dotted path; `language_model` is both graphs of a pair."""
     whole = len(parts) > 2 and parts[0] in ("graphs", "gates") and parts[1] == LANGUAGE_WHOLE[0]
     if whole and LANGUAGE_WHOLE[0] not in content[parts[0]] and parts[2] not in ("prefill", "decode"):
         halves = [name for name in LANGUAGE_PAIR if parts[2] != "top1" or name in CHOOSING]
@@ -273,7 +275,7 @@ def _places(content: Mapping[str, Any], parts: list[str]) -> list[list[str]]:
 def _set(table: dict[str, Any], parts: list[str], text: SettingText, path: str) -> None:
     """Set a value below a table; its type is checked where the tables are built. Raises TargetError."""
     while True:
-        # Names of graphs hold dots: the longest start that is a key.
+        # Graph names contain dots: take the longest prefix that is a key.
         ends = [end for end in range(len(parts), 0, -1) if ".".join(parts[:end]) in table]
         key, rest = ".".join(parts[: ends[0]]) if ends else parts[0], parts[ends[0] if ends else 1 :]
         if not rest:

@@ -1,4 +1,4 @@
-"""What a target is made of: every section of `export/targets/*.toml` (schema 2) as a frozen, validated dataclass."""
+"""Sections of a target file (`export/targets/*.toml`, schema 2) as frozen, validated dataclasses."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ METERS = ("ina3221", "nvml", "rapl", "none")
 STAGES = ("vision_encoder", "prefill", "decode", "semantic_context", "action_expert")
 SHARING = ("one-device", "own-cores")
 RUNTIME_MOST = {"tick_period_ms": 60_000, "max_new_tokens": 8192, "prefill_chunk_tokens": 8192}
-"""Largest values of [runtime] that still make sense; a larger one is a slip of the keyboard."""
+"""Largest plausible values of [runtime]; a larger one is a typing error."""
 MAX_FRAMES = 16
 MAX_CORES = 1024
 
 
 class TargetError(ValueError):
-    """A target that is not known or whose file is wrong; its text is the one line to show."""
+    """Unknown target or invalid target file; its text is the one line to show."""
 
 
 def _require(ok: bool, message: str) -> None:
@@ -39,36 +39,36 @@ def _known(name: str, known: Mapping[str, object] | tuple[str, ...], what: str) 
 
 @dataclass(frozen=True)
 class Figure:
-    """A number with its source; modelled unless measured on the very device, with a relative error if one is known."""
+    """Number with its source; modelled unless measured on this device, with a relative error if known."""
 
     value: float
     source: str
     tag: str = MODELLED
     error: float | None = None
-    """Half width of the error bar as a fraction of the value; None: the source gives none."""
+    """Half width of the error bar as a fraction of the value; None if the source has none."""
 
     @classmethod
     def from_setting(cls, text: str, where: str) -> Figure:
-        """A number of the command line; raises FieldError."""
+        """Convert a number of the command line. Raises FieldError."""
         return cls(from_text(float, text, where), "set on the command line")
 
     def __post_init__(self) -> None:
         _require(0 <= self.value < 1e9, f"value {self.value} must be between 0 and 1e9")
-        _require(bool(self.source.strip()), "source is empty: expected where the number comes from")
+        _require(bool(self.source.strip()), "source is empty: expected the number's source")
         _require(self.tag in (MODELLED, MEASURED), f"tag {self.tag!r} must be {MODELLED} or {MEASURED}")
         _require(self.error is None or 0 <= self.error < 1, f"error {self.error} must be between 0 and 1")
 
 
 @dataclass(frozen=True)
 class Device:
-    """Memory that the model shares with everything else, and what the doctor recognises the board by."""
+    """Memory shared by model and other programs, and the board's identification for the doctor."""
 
     memory_gib: float
     reserved_gib: float
-    """Operating system, desktop and the robot's other programs."""
+    """Memory of operating system, desktop and the robot's other programs, GiB."""
     source: str
     cores: int
-    """Processor cores that graphs on the CPU share; the roofline's CPU figures are for all of them."""
+    """Processor cores shared by graphs on the CPU; the roofline's CPU figures are for all of them."""
     compute_capability: str | None = None
     min_l4t: str | None = None
 
@@ -79,16 +79,16 @@ class Device:
 
 @dataclass(frozen=True)
 class PowerMode:
-    """One power mode of the board, found by its name."""
+    """Power mode of the board, identified by name."""
 
     compute: Figure
     """Compute roofs in this mode as a multiple of those of [roofline]."""
     memory: Figure
     """Memory bandwidth as a multiple of that of [roofline]."""
     busy_w: Figure | None = None
-    """Power with everything busy."""
+    """Power under full load, W."""
     reboot: bool = False
-    """Switching to it needs a reboot."""
+    """Whether switching to it needs a reboot."""
 
     def __post_init__(self) -> None:
         _require(self.compute.value > 0 and self.memory.value > 0, "compute and memory must be positive")
@@ -96,14 +96,14 @@ class PowerMode:
 
 @dataclass(frozen=True)
 class Power:
-    """The budget, the mode that the plan is made for, and the meter that the governor reads."""
+    """Power budget, the plan's power mode, and the governor's meter."""
 
     mode: str
     modes: Mapping[str, PowerMode]
     meter: str
     rail: str | None = None
     budget_w: float | None = None
-    """None: no budget (a development machine)."""
+    """Budget, W; None on a development machine."""
     idle_w: Figure | None = None
 
     def __post_init__(self) -> None:
@@ -117,27 +117,27 @@ class Power:
 
     @property
     def selected(self) -> PowerMode:
-        """The mode that `mode` names."""
+        """The power mode named `mode`."""
         return self.modes[self.mode]
 
 
 @dataclass(frozen=True)
 class Roofline:
-    """Peaks of the device in the mode that [power] names with compute = memory = 1, and how much of them is reached."""
+    """Peaks of the device in the power mode with compute = memory = 1, and the reachable shares."""
 
     fp32_gflops: Figure
     fp16_gflops: Figure
     int8_gops: Figure
     memory_gbps: Figure
     compute_efficiency: Mapping[str, Figure]
-    """Per stage, the share of the compute peak that its matrix products reach."""
+    """Stage → reached share of the compute peak in its matrix products."""
     memory_efficiency: Figure
     sharing: str
     """`one-device`: both threads use one accelerator in turns; `own-cores`: each has cores, they share bandwidth."""
     tick_slowdown: Figure
-    """Tick with reasoning running beside it, as a multiple of the tick alone (without waiting for a call in flight)."""
+    """Tick while reasoning runs, as a multiple of the tick alone (without waiting for a call in flight)."""
     generation_slowdown: Figure
-    """Generation with control running beside it, as a multiple of the generation alone (without its turns)."""
+    """Generation while control runs, as a multiple of the generation alone (without waiting for control)."""
 
     def __post_init__(self) -> None:
         for name in ("fp32_gflops", "fp16_gflops", "int8_gops", "memory_gbps"):
@@ -153,14 +153,14 @@ class Roofline:
             _require(getattr(self, name).value >= 1, f"{name} must be at least 1")
 
     def peak(self, roof: str) -> Figure:
-        """Compute peak of a roof in GFLOP/s."""
+        """Return the compute peak of a roof, GFLOP/s."""
         figure: Figure = {"fp32": self.fp32_gflops, "fp16": self.fp16_gflops, "int8": self.int8_gops}[roof]
         return figure
 
 
 @dataclass(frozen=True)
 class Compute:
-    """Which roof a provider's kernels run under, by the precision of the weights; absent: it has no such kernel."""
+    """Roof of a provider's kernels by precision of the weights; absent if it has no such kernel."""
 
     attention: str
     fp32: str | None = None
@@ -175,7 +175,7 @@ class Compute:
                 _known(roof, ROOFS, f"compute.{name}")
 
     def roof(self, precision: str) -> str | None:
-        """Roof for weights of a precision, None if the provider has no kernel for it."""
+        """Return the roof for a precision of the weights; None if the provider has no kernel for it."""
         kind = "blocks" if block_size(precision) is not None else precision
         roof: str | None = getattr(self, kind)
         return roof
@@ -183,25 +183,25 @@ class Compute:
 
 @dataclass(frozen=True)
 class Provider:
-    """An execution provider of ONNX Runtime and how it is opened."""
+    """Execution provider of ONNX Runtime with its options."""
 
     name: str
     forms: tuple[str, ...]
     compute: Compute
     activation_bytes: int
     call_overhead_ms: Figure
-    """Launching one call's kernels."""
+    """Time to launch a call's kernels."""
     workspace_gib: Figure
-    """Memory that the provider takes beyond weights, caches and activations."""
+    """Memory of the provider beyond weights, caches and activations."""
     engine: bool = False
-    """It compiles an engine, which has to be built on the device before any run."""
+    """Whether it compiles an engine, which must be built on the device before a run."""
     options: Mapping[str, str] = field(default_factory=dict)
     requires: Mapping[str, str] = field(default_factory=dict)
     """Package → version specifier."""
     index_url: str | None = None
-    """Package index where those packages are, if not the usual one."""
+    """Package index of those packages, if not the default."""
     uses_cores: bool = False
-    """Its speed depends on the graph's threads."""
+    """Whether its speed depends on the graph's threads."""
 
     def __post_init__(self) -> None:
         _require(self.name.endswith("ExecutionProvider"), f"name {self.name!r} is not an ONNX Runtime provider's")
@@ -212,19 +212,19 @@ class Provider:
 
 @dataclass(frozen=True)
 class GraphPolicy:
-    """How one graph is written, rounded and run."""
+    """How to write, round and run one graph."""
 
     provider: str
     form: str
     precision: str
     overrides: Mapping[str, str] = field(default_factory=dict)
-    """Layer name pattern → precision; the first that matches wins."""
+    """Layer name pattern → precision; the first match applies."""
     candidates: tuple[str, ...] = ()
-    """Precisions that the sensitivity search may choose from, from the most to the least exact."""
+    """Candidates of the sensitivity search, from the most to the least exact."""
     threads: int | None = None
-    """Intra-op threads; None: one, where it matters."""
+    """Intra-op threads; None: one, if the provider uses threads."""
     profile: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
-    """Free axis → (min, opt, max) lengths that an engine is built for."""
+    """Free axis → (min, opt, max) lengths of an engine."""
 
     def __post_init__(self) -> None:
         _known(self.form, FORMS, "form")
@@ -240,19 +240,19 @@ class GraphPolicy:
             )
 
     def precisions(self) -> Precision:
-        """Precision of every layer."""
+        """Return the precision of every layer."""
         return Precision(self.precision, tuple(self.overrides.items()))
 
 
 @dataclass(frozen=True)
 class GraphGate:
-    """Thresholds of one graph's check against PyTorch; below a limit it fails, below `warn_cosine` it warns."""
+    """Thresholds of one graph's comparison with PyTorch; below a limit it fails, below `warn_cosine` it warns."""
 
     inputs: int
     min_cosine: float
     max_abs: float
     min_difference: float
-    """Two different inputs must give outputs that differ by this much: a graph that ignores its input fails."""
+    """Smallest difference between the outputs of two different inputs: a graph that ignores its input fails."""
     warn_cosine: float | None = None
     top1: float | None = None
     """Least share of positions with the same most likely token."""
@@ -270,7 +270,7 @@ class GraphGate:
 
 @dataclass(frozen=True)
 class TaskGate:
-    """Thresholds of what rounding does to the robot, worst case over the delays of the semantic state."""
+    """Thresholds of the task error, worst case over the delays of the semantic state."""
 
     waypoint_cm: float
     heading_deg: float
@@ -279,18 +279,18 @@ class TaskGate:
     warn_waypoint_cm: float | None = None
     warn_heading_deg: float | None = None
     relative: float = 1.0
-    """Mean deviation as a share of how much the model's own plans vary: at 1 nothing of them is left. Centimetres
-    mean little for a model whose plans are short, as those of untrained weights are."""
+    """Largest mean deviation as a share of the spread of the model's plans; at 1 the plans are lost. Centimetres are
+    a weak measure for short plans, such as those of untrained weights."""
     warn_relative: float = 0.5
     kv_cosine: float = 0.9
-    """Least cosine of the semantic state to the exact one."""
+    """Smallest cosine of the semantic state to the exact one."""
     warn_kv_cosine: float = 0.97
     token_agreement: float = 0.1
-    """Least share of the text before the first other token, for trained weights."""
+    """Smallest share of the text before the first different token, for trained weights."""
     warn_token_agreement: float = 0.5
     min_semantic: float = 0.01
-    """Least share of the plans' own spread that another semantic state has to move them by: below it, no figure here
-    separates a language model that works from one that does not."""
+    """Smallest change of the plans by another semantic state, as a share of their spread: below it the task error
+    cannot detect a broken language model."""
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
@@ -300,7 +300,7 @@ class TaskGate:
 
 @dataclass(frozen=True)
 class RuntimePolicy:
-    """Rates and lengths that the runner takes from the manifest, and what the plan must keep."""
+    """Rates and lengths that the runner reads from the manifest, and limits of the plan."""
 
     tick_period_ms: int
     max_new_tokens: int
@@ -308,14 +308,14 @@ class RuntimePolicy:
     prefill_chunk_tokens: int
     kv_dtype: str
     max_delay_s: float
-    """Ceiling on Δt, the age of the semantic state in use."""
+    """Largest Δt, the age of the semantic state in use, s."""
     enforce_plan: bool
-    """Whether a plan that does not fit stops the export."""
+    """Whether the export refuses a plan that does not fit."""
     control_cores: tuple[int, ...] = ()
-    """Processor cores of the control thread; empty: the runner decides by those it finds."""
+    """Processor cores of the control thread; empty: the runner chooses."""
     reasoning_cores: tuple[int, ...] = ()
     control_priority: int = 50
-    """Real-time priority of the control thread, 1 to 59; 0: none. The bridge's is above it."""
+    """Real-time priority of the control thread, 1 to 59, below the bridge's; 0: none."""
     decoding: str = Decoding.CONSTRAINED.value
     recovery: str = RecoverySwitch.ON.value
     """Defaults of the runner's switches (`edge/state/switches.py`)."""
@@ -345,7 +345,7 @@ class RuntimePolicy:
 
 @dataclass(frozen=True)
 class Measured:
-    """One measurement that replaces the modelled time of exactly this model, graph, precision, form and provider."""
+    """Measurement that replaces the modelled time of this model, graph, precision, form and provider."""
 
     model: str
     graph: str
@@ -358,20 +358,20 @@ class Measured:
     tokens_per_s: float | None = None
     overrides: Mapping[str, str] = field(default_factory=dict)
     tokens: int | None = None
-    """Prompt or context tokens it was taken at; None where time does not depend on them."""
+    """Prompt or context tokens of the measurement; None if time does not depend on them."""
     chunk_tokens: int | None = None
-    """Prompt tokens a call, for prefill."""
+    """Prompt tokens per call, for prefill."""
     threads: int | None = None
     mode: str | None = None
-    """Power mode it was taken in."""
+    """Power mode of the measurement."""
     error: float | None = None
     energy_j: float | None = None
-    """Energy above idle of what `ms` times, or of one token (edge-calib power); the governor starts from it."""
+    """Energy above idle of the timed call, or of one token, J (edge-calib power); the governor's initial value."""
 
     def __post_init__(self) -> None:
         _require((self.ms is None) != (self.tokens_per_s is None), "give either ms or tokens_per_s")
         given = self.ms if self.ms is not None else self.tokens_per_s
         _require(given is not None and given > 0, "ms or tokens_per_s must be positive")
         _require(self.energy_j is None or 0 <= self.energy_j < 1e6, f"energy_j {self.energy_j} must be 0 to 1e6 J")
-        _require(bool(self.machine.strip()), "machine is empty: expected where it was measured")
+        _require(bool(self.machine.strip()), "machine is empty: expected the name of the measured machine")
         _require(self.error is None or 0 <= self.error < 1, f"error {self.error} must be between 0 and 1")

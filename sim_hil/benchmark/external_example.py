@@ -47,7 +47,7 @@ class Walker:
         self._speed_mps = min(0.4, max_speed_mps)
 
     def act(self, picture: npt.NDArray[np.uint8], state: Sequence[float]) -> tuple[list[float], str]:
-        """Velocity (vx m/s, vy m/s, wz rad/s) and a text for the log."""
+        """Return velocity (vx m/s, vy m/s, wz rad/s) and a text for the log."""
         ahead = picture[picture.shape[0] // 3 :].astype(np.float64).mean(axis=(0, 2))
         left, right = ahead[: len(ahead) // 2].mean(), ahead[len(ahead) // 2 :].mean()
         turn = float(np.clip((left - right) / 40.0, -0.5, 0.5))

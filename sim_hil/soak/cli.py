@@ -134,7 +134,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         try:
             with Progress("edge-soak: ", period_s=STATUS_PERIOD_S) as progress:
                 finished = run_legs(
-                    soak, options, menu, stopped=lambda: bool(stop), show_status=progress.show, log=progress.say,
+                    soak, options, menu, stopped=lambda: bool(stop), show_status=progress.show, log=progress.log,
                     keep_logs=args.keep_logs,
                 )  # fmt: skip
         except (StepError, ValueError) as error:

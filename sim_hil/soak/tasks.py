@@ -74,7 +74,7 @@ class Journey:
                     length_m = _length_m(task.path)
                     if lengths_m[0] <= length_m <= lengths_m[1]:
                         return self._task(
-                            at, task.goal, thing, length_m, wordings(task.told, 1, seed, held_out=True)[0]
+                            at, task.goal, thing, length_m, wordings(task.route, 1, seed, held_out=True)[0]
                         )
                 except (RouteError, WordingError):
                     continue

@@ -53,7 +53,7 @@ def test_a_long_stage_says_now_and_then_what_it_is_at(clock: list[int]) -> None:
 
 def test_nothing_is_written_to_standard_output(capsys: pytest.CaptureFixture[str]) -> None:
     with BuildProgress("edge-export", STAGES) as progress, progress.stage("weights"):
-        progress.say("a note")
+        progress.log("a note")
     captured = capsys.readouterr()
     assert captured.out == ""
     assert "edge-export: a note" in captured.err
@@ -92,7 +92,7 @@ def test_durations_are_words(seconds: float, shown: str) -> None:
 
 def test_text_in_brackets_and_colons_is_printed_as_it_is() -> None:
     out = io.StringIO()
-    Progress("x: ", stream=out).say("found [1, 30, 3] in [bold]name[/bold] :smile:")
+    Progress("x: ", stream=out).log("found [1, 30, 3] in [bold]name[/bold] :smile:")
     assert out.getvalue() == "x: found [1, 30, 3] in [bold]name[/bold] :smile:\n"
 
 
@@ -130,14 +130,14 @@ def test_without_a_period_only_lines_are_printed() -> None:
     out = io.StringIO()
     with Progress("", bar=True, period_s=None, stream=out) as progress:
         progress.show("a status", 1, 1)
-        progress.say("a line")
+        progress.log("a line")
     assert out.getvalue() == "a line\n"
 
 
 def test_a_terminal_shows_the_status_and_lines_above_it() -> None:
     out = Terminal()
     with BuildProgress("edge-export", STAGES, out) as build, build.stage("graph"):
-        build.say("a note")
+        build.log("a note")
     assert "edge-export: a note\n" in out.getvalue() and "[2/3] graph" in out.getvalue()
 
 
@@ -145,6 +145,6 @@ def test_a_terminal_shows_one_bar_for_all_parts() -> None:
     out = Terminal()
     with Progress("x: ", bar=True, stream=out) as progress:
         progress.show("loss 0.5", 1, 4)
-        progress.say("a line")
+        progress.log("a line")
         progress.show("", 9, 9)
     assert "x: a line\n" in out.getvalue() and "9/9" in out.getvalue()

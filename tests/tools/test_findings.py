@@ -256,9 +256,7 @@ def test_the_suite_that_training_writes_is_taken(tmp_path: Path, capsys: Any) ->
     root = models(tmp_path / "models", "rl")
     assert run(root, tmp_path / "out", suite, "--dry-run") == EXIT_DONE
     found = capsys.readouterr().err
-    assert (
-        "runs of 2 episodes" in found and "not run: row wordings: the episodes' own wordings are of training" in found
-    )
+    assert "runs of 2 episodes" in found and "not run: row wordings: the episodes' wordings have training" in found
     episodes = load_suite(suite)
     assert {load_scene(each.scene).name for each in episodes} == {Path(each.scene).stem for each in episodes}
     for name in ("rl-swapped", "rl-training-words"):

@@ -53,7 +53,7 @@ def test_without_a_policy_of_its_own_ppo_has_left_imitations(stages: tuple[str, 
 
 def test_a_run_without_a_policy_of_ppo_is_reported(tmp_path: Path, command: list[str], capsys: Any) -> None:
     assert main(["--run", str(run_of(tmp_path / "run", "imitate")), "--out", str(tmp_path / "m")], command) == EXIT_DONE
-    assert "rl: reinforcement learning has left no policy of its own" in capsys.readouterr().err
+    assert "rl: reinforcement learning kept no policy" in capsys.readouterr().err
 
 
 def test_every_model_has_a_folder_of_its_own(tmp_path: Path, command: list[str]) -> None:

@@ -8,7 +8,7 @@ from edge.core.cli import EXIT_BAD_INPUT
 
 
 def command_parser(page: str | None, *, artifacts: bool = False) -> argparse.ArgumentParser:
-    """A parser with the module's page as its help and the options that benchmarks share."""
+    """Create a parser with the module's docstring as help and the benchmarks' common options."""
     p = argparse.ArgumentParser(description=page, formatter_class=argparse.RawDescriptionHelpFormatter)
     if artifacts:
         p.add_argument("--artifacts", type=Path, required=True, metavar="DIR", help="artifact directory")

@@ -1,11 +1,11 @@
-"""What the reasoning thread costs the control thread: one long drive in which the VLM is on and off in turn.
+"""Measures the effect of the reasoning thread on the control thread in one drive with the VLM alternately on and off.
 
     python -m tools.bench.contention --artifacts out/demo/artifacts --duration 600 --json out/bench/contention.json
 
-Real processes on loopback: edge-hil, edge-bridge and the runner. Two things are replaced in it: its reasoning budget,
-allowed for a block of time and forbidden for the next, so that both are measured in one run; and the plan that an
-untrained network would walk into a wall with, by one that keeps the robot on a circle (the network runs all the same).
-Generations follow one another without a pause while they are allowed. A tick is timed from its deadline to its command.
+Real processes on loopback: edge-hil, edge-bridge and the runner. Two parts of the runner are replaced. Its reasoning
+budget alternates between blocks with and without reasoning. Its plan is a circle, because an untrained network would
+walk into a wall; the network still runs. While allowed, generations follow one another without a pause. A tick is timed
+from its deadline to its command.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ from tools.demo import INSTRUCTION
 from tools.faults import circle
 
 BLOCK_S = 8.0
-"""Shorter than a semantic state may grow old before the robot slows down."""
+"""Length of a block, s: shorter than the age of a semantic state at which the robot slows down."""
 SETTLE_S = 1.0
-"""Left out after every change: a generation under way is being ended."""
+"""Time ignored after every change, s, in which the current generation ends."""
 P999_MS = 100.0
 RATIO = 1.25
 STEP_S = 0.1
@@ -49,26 +49,26 @@ RIPPLE_RAD = 0.7
 Floats = npt.NDArray[np.float32]
 State = tuple[float, float, float]
 DRIVE = "--drive"
-"""First argument of the process that is the runner."""
+"""First argument that selects the runner's process."""
 
 
 @dataclass(frozen=True)
 class Tick:
-    """One tick of the log."""
+    """Tick of the log."""
 
     start_ns: int
     tick_ms: float
     reasoning: bool | None
-    """Whether reasoning was allowed; None too near to a change."""
+    """Whether reasoning was allowed; None shortly after a change."""
 
 
 def allowed(now_ns: int) -> bool:
-    """Blocks begin on the monotonic clock, which runner and report share."""
+    """Return whether the block allows reasoning; runner and report share the monotonic clock."""
     return int(now_ns / 1e9 / BLOCK_S) % 2 == 0
 
 
 def drive(arguments: Sequence[str]) -> int:
-    """`edge-run` whose power governor allows reasoning in every other block."""
+    """Run `edge-run` with a power governor that allows reasoning in every other block."""
 
     def budget(_monitor: PowerMonitor) -> ReasoningBudget:
         return UNLIMITED if allowed(time.monotonic_ns()) else ReasoningBudget(allowed=False)
@@ -87,7 +87,7 @@ def drive(arguments: Sequence[str]) -> int:
 
 
 def read_ticks(log: Path) -> tuple[list[Tick], int, float]:
-    """Ticks of a flight log, its number of generations, and the share of allowed time they took. RecordingError."""
+    """Read a flight log's ticks, its number of generations, and their share of allowed time. Raises RecordingError."""
     ticks: list[Tick] = []
     generations, busy_ns = 0, 0
     for topic, _, record in read_messages(log):
@@ -104,7 +104,7 @@ def read_ticks(log: Path) -> tuple[list[Tick], int, float]:
 
 
 def block_ratios(ticks: Sequence[Tick]) -> list[float]:
-    """Median with reasoning over median without, of every pair of neighbouring blocks."""
+    """Return the ratio of medians with and without reasoning for every pair of neighbouring blocks."""
     blocks: dict[int, list[float]] = {}
     for tick in ticks:
         if tick.reasoning is not None:
@@ -115,7 +115,7 @@ def block_ratios(ticks: Sequence[Tick]) -> list[float]:
 
 
 def summarise(ticks: Sequence[Tick], missed: int, generations: int, busy: float) -> dict[str, object]:
-    """Figures and verdicts; raises ValueError for a log without both phases."""
+    """Compute figures and verdicts. Raises ValueError for a log without both phases."""
     figures: dict[str, dict[str, float]] = {}
     phases = {"all": (True, False, None), "reasoning": (True,), "alone": (False,)}
     for name, phase in phases.items():
@@ -163,7 +163,7 @@ def _run(artifacts: Path, duration_s: float, folder: Path) -> tuple[list[Tick], 
 
 @command_line("contention")
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     arguments = sys.argv[1:] if argv is None else argv
     if arguments[:1] == [DRIVE]:
         return drive(arguments[1:])
@@ -194,7 +194,7 @@ def _print(result: dict[str, object]) -> None:
     console.print(table)
     console.print(
         f"missed {result['missed']}; median with reasoning over alone {result['ratio']} (bound {RATIO}); "
-        f"{result['generations']} generations, busy {result['reasoning_share']} of the time they were allowed"
+        f"{result['generations']} generations, which took {result['reasoning_share']} of the allowed time"
     )
 
 

@@ -1,10 +1,10 @@
-"""Odometry drift: how much better the fused motion offset is than the robot's own, and whether it knows how good it is.
+"""Odometry drift: error of the fused motion offset against the robot's own, and consistency of its covariance.
 
     python -m tools.bench.drift --walks 50 --jobs 2 --json out/bench/drift.json
 
-Every walk is the simulated Go2 under physics in the corridor with its camera; its odometry is then made to drift at the
-paper's two levels (table 14), as `sim_hil.robots.odometry_noise` does. Compared over windows of 5 s: the robot's own
-motion offset, the estimator's, and the truth. Exit code 1 when a bound of `GATES` is not kept.
+Every walk is the simulated Go2 under physics in the corridor with its camera; `sim_hil.robots.odometry_noise` then adds
+the paper's two levels of drift (table 14). Compared over windows of 5 s: the robot's own motion offset, the
+estimator's, and the truth. Exit code 1 if a bound of `GATES` does not hold.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ SEGMENT_M = 0.25
 MAX_RATIO = 0.5
 MAX_RATE_ERROR = 0.25
 CHI2_95_3 = 7.815
-"""95 % of chi-square with 3 degrees of freedom."""
+"""95 % quantile of chi-square with 3 degrees of freedom."""
 TESTED = ("typical", "severe")
 
 
@@ -61,7 +61,7 @@ class Window:
 
 @dataclass(frozen=True)
 class DriftRun:
-    """One walk at one level of drift."""
+    """Result of one walk at one level of drift."""
 
     seed: int
     level: str
@@ -81,7 +81,7 @@ class DriftRun:
 
 
 def replay(walk: Walk, level: str, seed: int) -> DriftRun:
-    """Let the odometry of a walk drift and the estimator work against it."""
+    """Add drift to a walk's odometry and run the estimator."""
     noise = OdometryNoise(LEVELS[level], seed, walk.samples[0].T_world_base)
     estimator = DriftEstimator(stamp_sigma_s=SensorNoise().stamp_ns / 1e9)
     truth_monitor = _TrueDrift()
@@ -197,21 +197,21 @@ def _window(walk: Walk, raws: Sequence[SE2], estimator: DriftEstimator, index: i
 
 
 def chi_square_band(degrees: int) -> tuple[float, float]:
-    """Two-sided 95 % band of chi-square with many degrees of freedom (Wilson and Hilferty's approximation)."""
+    """Return the two-sided 95 % band of chi-square with many degrees of freedom (Wilson-Hilferty approximation)."""
     spread = math.sqrt(2 / (9 * degrees))
     low, high = ((1 - 2 / (9 * degrees) + z * spread) ** 3 * degrees for z in (-1.959964, 1.959964))
     return low, high
 
 
 def summarise(runs: Sequence[DriftRun]) -> dict[str, Any]:
-    """What one level came to, and whether each bound is kept."""
+    """Summarise the runs of one level and check each bound."""
     windows = [window for run in runs for window in run.windows]
 
     def rms(name: str) -> float:
         return math.sqrt(float(np.mean([getattr(window, name) ** 2 for window in windows])))
 
     ratio_m, ratio_rad = rms("fused_m") / rms("raw_m"), rms("fused_rad") / rms("raw_rad")
-    # Windows of one walk share its biases: one of each walk, the last, makes independent samples.
+    # Windows of a walk share its biases: use only each walk's last window as an independent sample.
     nees = float(np.mean([run.windows[-1].nees for run in runs]))
     low, high = (bound / len(runs) for bound in chi_square_band(3 * len(runs)))
     translation = [abs(run.estimated_m_per_m / run.true_m_per_m - 1) for run in runs]
@@ -262,7 +262,7 @@ def _spread(errors: Sequence[float]) -> dict[str, float]:
 def walk_and_replay(
     seed: int, *, scene: str, people: int, distance_m: float
 ) -> tuple[list[DriftRun], dict[str, float]]:
-    """One walk at both levels, and what its camera took."""
+    """Record one walk and replay it at both levels; returns the runs and the camera's computing times."""
     cv2.setNumThreads(1)
     walk = record_walk(load_scene(scene), seed, distance_m=distance_m, people=people, noise=SensorNoise())
     runs = [replay(walk, level, 1000 * seed + index) for index, level in enumerate(TESTED)]
@@ -301,11 +301,11 @@ def _table(summary: dict[str, Any]) -> str:
 
 @command_line("drift")
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     p = command_parser(__doc__)
     p.add_argument("--walks", type=int, default=50, metavar="N", help="walks, each at both levels (default 50)")
-    p.add_argument("--seed", type=int, default=0, metavar="N", help="of the first walk (default 0)")
-    p.add_argument("--distance", type=float, default=23.0, metavar="M", help="path of a walk (default 23)")
+    p.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the first walk (default 0)")
+    p.add_argument("--distance", type=float, default=23.0, metavar="M", help="length of a walk, m (default 23)")
     p.add_argument("--people", type=int, default=1, metavar="N", help="walking people (default 1)")
     p.add_argument("--scene", default="corridor", metavar="NAME")
     p.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default 1)")

@@ -1,4 +1,4 @@
-"""Does the governor keep the budget? The real one, on a modelled Orin NX with a fake clock, at five loads.
+"""Tests whether the governor keeps the power budget, on a modelled Orin NX with a fake clock, at five loads.
 
     python -m tools.bench.governor --json out/bench/governor.json
 
@@ -7,7 +7,7 @@ plan's power: `light` needs no shedding, `limit` would draw exactly the budget, 
 for three times, `lag` is `far` with a meter that averages over a second, as NVML's may. Meter noise, lost readings,
 texts of random length, heat and leakage are added. The judge is the device's true power, not the governor's figures.
 Exit code 1: the 10 s average was above the budget + 2 % later than 30 s after the start, control missed a tick, or
-reasoning was shed where it need not be. Everything here is modelled.
+reasoning was shed without need. All numbers are modelled.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from tools.bench import bad_input, command_parser
 
 WINDOW_S, SETTLE_S, TOLERANCE, LENGTH_S = 10.0, 30.0, 0.02, 600.0
 NOISE, LOST = 0.02, 0.01
-"""Of a reading: relative standard deviation, and share that never comes. Assumptions."""
+"""Relative standard deviation of a reading, and share of lost readings. Assumptions."""
 REST_C, C_PER_W = 51.6, 1.39
-"""Steady temperature over power: a line through ARK's notes for the Orin NX (4.6 W 58 °C, 29.4 W 89 to 92 °C)."""
+"""Line of steady temperature over power, from ARK's notes on the Orin NX (4.6 W 58 °C, 29.4 W 89 to 92 °C)."""
 HEAT_S, LEAKAGE_PER_C = 60.0, 0.002
-"""Thermal time constant, and growth of what a stage draws with temperature. Assumptions."""
+"""Thermal time constant, and growth of a stage's power with temperature. Assumptions."""
 LOADS: Final = ("light", "limit", "plan", "far", "lag")
 LAG_S: Final = 1.0
 
 
 @dataclass(frozen=True)
 class Stages:
-    """Power and length of what the device does, from the plan."""
+    """Power and duration of the device's stages, from the plan."""
 
     idle_w: float
     rise_w: float
@@ -55,7 +55,7 @@ class Stages:
 
 
 def orin() -> tuple[Stages, PowerPlan]:
-    """The paper-size model on the target `orin`."""
+    """Return stages and power plan of the paper-size model on the target `orin`."""
     target, config = load_target("orin", "1b"), PRESETS["1b"]
     made = plan(target, config).to_dict()
     stages = made["per_graph"]
@@ -75,7 +75,7 @@ def orin() -> tuple[Stages, PowerPlan]:
 
 
 def load_factor(load: str, stages: Stages, budget_w: float) -> float:
-    """By how much a load's generations draw more than the plan's."""
+    """Return the ratio of power of a load's generations to the plan's."""
     control_w = stages.rise_w * stages.tick_s / stages.period_s
     rest_w = stages.rise_w * (1 - stages.tick_s / stages.period_s)
     limit = (budget_w - stages.idle_w - control_w) / rest_w
@@ -83,7 +83,7 @@ def load_factor(load: str, stages: Stages, budget_w: float) -> float:
 
 
 class Reasoning:
-    """The reasoning loop as the governor sees it: asks for its budget before a generation and between calls."""
+    """Model of the reasoning loop: requests its budget before a generation and between calls."""
 
     def __init__(self, stages: Stages, max_tokens: int, rng: random.Random) -> None:
         self._stages, self._max_tokens, self._rng = stages, max_tokens, rng
@@ -96,11 +96,11 @@ class Reasoning:
 
     @property
     def running(self) -> bool:
-        """A generation is under way."""
+        """Whether a generation is in progress."""
         return bool(self._calls)
 
     def next_call(self, now_s: float, budget: ReasoningBudget) -> float | None:
-        """Length of the next call; None: nothing to run now."""
+        """Return the duration of the next call, s; None if there is none now."""
         if self._calls and not budget.allowed:
             self._calls.clear()
             self.busy_s += now_s - self.began_s
@@ -118,7 +118,7 @@ class Reasoning:
         return self._calls[0]
 
     def done(self, now_s: float) -> None:
-        """The call that was given has ended."""
+        """Record the end of the current call."""
         self._calls.pop(0)
         if not self._calls:
             self._finished_s = now_s
@@ -126,13 +126,13 @@ class Reasoning:
             self.generations += 1
 
     def taken_s(self, now_s: float) -> float:
-        """Time that generations have taken so far."""
+        """Return the total time of generations so far, s."""
         return self.busy_s + (now_s - self.began_s if self.running else 0.0)
 
 
 @dataclass
 class Run:
-    """What happened, period by period."""
+    """Record of a run by period."""
 
     true_w: list[float]
     average_w: list[float | None]
@@ -146,7 +146,7 @@ class Run:
 
 
 def simulate(load: str, *, seconds: float = LENGTH_S, seed: int = 0, governed: bool = True) -> Run:
-    """Drive the governor on the modelled device for that long; `governed` off: its budget is ignored."""
+    """Run the governor on the modelled device; without `governed` its budget is ignored."""
     stages, power = orin()
     budget_w = power.budget_w or math.nan
     factor = load_factor(load, stages, budget_w)
@@ -160,7 +160,7 @@ def simulate(load: str, *, seconds: float = LENGTH_S, seed: int = 0, governed: b
     for index in range(round(seconds / stages.period_s)):
         start_s, end_s = index * stages.period_s, (index + 1) * stages.period_s
         hot = 1 + LEAKAGE_PER_C * (temperature_c - REST_C - C_PER_W * 25.0)
-        # Energy of a call that reaches into the next period is that period's.
+        # The energy of a call beyond the period's end belongs to the next period.
         energy_j, carried_j = carried_j, 0.0
         free_s = max(start_s, free_s) + stages.tick_s
         energy_j += stages.tick_s * stages.rise_w * hot
@@ -194,7 +194,7 @@ def simulate(load: str, *, seconds: float = LENGTH_S, seed: int = 0, governed: b
 
 
 def averages(true_w: list[float], period_s: float) -> list[float]:
-    """Mean power of every whole window of 10 s; the first ends 10 s after the start."""
+    """Return the mean power of every whole window of 10 s; the first ends 10 s after the start."""
     width = round(WINDOW_S / period_s)
     total = sum(true_w[:width])
     found = [total / width]
@@ -205,7 +205,7 @@ def averages(true_w: list[float], period_s: float) -> list[float]:
 
 
 def judge(load: str, run: Run, budget_w: float, period_s: float = 0.1) -> dict[str, Any]:
-    """Figures of one run and whether they are those that are asked for."""
+    """Compute the figures of one run and check them."""
     windows = averages(run.true_w, period_s)
     over = [WINDOW_S + i * period_s for i, w in enumerate(windows) if w > budget_w * (1 + TOLERANCE)]
     settle_s = over[-1] if over else 0.0
@@ -235,10 +235,10 @@ def judge(load: str, run: Run, budget_w: float, period_s: float = 0.1) -> dict[s
 
 @command_line("governor")
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     p = command_parser(__doc__)
     p.add_argument("--seconds", type=float, default=LENGTH_S, help="modelled length of each run (default: 600)")
-    p.add_argument("--seed", type=int, default=0, help="of noise and texts (default: 0)")
+    p.add_argument("--seed", type=int, default=0, help="seed of noise and texts (default: 0)")
     args = p.parse_args(argv)
     try:
         check_result_target(args.json)

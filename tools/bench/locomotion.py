@@ -1,11 +1,11 @@
-"""The locomotion table: what the simulated Go2 makes of its commands, and what it takes to make it fall.
+"""The locomotion table: how the simulated Go2 follows commands, and which pushes make it fall.
 
     python -m tools.bench.locomotion --json out/bench/locomotion.json
     python -m tools.bench.locomotion --rate 240 --minutes 5 --seeds 2 --jobs 2
 
 Commanded against achieved velocity (means over 3 s after settling) on flat ground, over 5 cm bumps and an 8 degree ramp
-(up, down, across); falls in minutes of random commands; pushes, falls and recoveries; seconds of simulation a second of
-processor buys. `--rate` is the physics' rate: 500 Hz is edge-hil's. Exit code 1 when a row is not within its bound.
+(up, down, across); falls in minutes of random commands; pushes, falls and recoveries; seconds of simulation per second
+of processor time. `--rate` is the physics' rate: 500 Hz is edge-hil's. Exit code 1 if a row exceeds its bound.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ SPEED_RATES_HZ = (500, 480, 240)
 
 @dataclass(frozen=True)
 class Job:
-    """One thing to simulate, and which of the table's parts it belongs to."""
+    """One simulation and its part of the table."""
 
     part: str
     call: Callable[..., object]
@@ -55,7 +55,7 @@ class Job:
 
 
 def envelope() -> tuple[Command, ...]:
-    """Every flat-ground command of the table: each axis alone, then combinations."""
+    """Return every flat-ground command of the table: each axis alone, then combinations."""
     alone: list[Command] = [(vx, 0.0, 0.0) for vx in FORWARD_MPS]
     alone += [(0.0, vy, 0.0) for vy in SIDEWAYS_MPS] + [(0.0, 0.0, wz) for wz in TURNS_RADPS]
     mixed = product((-0.6, 0.0, 0.6, 1.0, 1.5), (-0.3, 0.0, 0.3), (-1.0, -0.5, 0.0, 0.5, 1.0))
@@ -63,7 +63,7 @@ def envelope() -> tuple[Command, ...]:
 
 
 def plan(rate_hz: int, minutes: float, seeds: Sequence[int], repeats: int) -> list[Job]:
-    """All jobs of a run; the speed comes last, alone."""
+    """Return all jobs of a run; measurements of speed are last and run alone."""
     jobs = [Job("endurance", endure, (rate_hz, seed, 60.0 * minutes)) for seed in seeds]
     jobs += [Job("ground", travel, (name, rate_hz)) for name in ROUTES]
     jobs += [Job("pushes", push_over, (index, rate_hz)) for index in range(len(PUSHES))]
@@ -76,7 +76,7 @@ def _run(job: Job) -> object:
 
 
 def run_all(jobs: Sequence[Job], processes: int) -> dict[str, list[Any]]:
-    """Results by part, in the order of the jobs; nothing else runs beside the measurements of speed."""
+    """Run all jobs; returns results by part in the order of the jobs. Measurements of speed run alone."""
     results: dict[str, list[Any]] = {part: [] for part in ("flat", "ground", "endurance", "pushes", "speed")}
     with Progress("locomotion: ", bar=True) as progress:
         for together in (True, False):
@@ -104,7 +104,7 @@ def _row_line(row: Row) -> str:
 
 
 def table(results: dict[str, list[Any]]) -> str:
-    """The table as text: (vx m/s, vy m/s, wz rad/s) commanded -> achieved."""
+    """Format the table: (vx m/s, vy m/s, wz rad/s) commanded -> achieved."""
     flat: list[Row] = results["flat"]
     ground: list[Row] = results["ground"]
     lines = [f"flat: {len(flat)} commands, {sum(row.kept for row in flat)} within their bound"]
@@ -143,10 +143,12 @@ def _speeds(speeds: Sequence[Speed]) -> dict[int, list[Speed]]:
 
 @command_line("locomotion")
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     p = command_parser(__doc__)
     p.add_argument("--rate", type=int, default=500, metavar="HZ", help="steps of physics a second (default 500)")
-    p.add_argument("--minutes", type=float, default=30.0, metavar="M", help="of random commands per seed (default 30)")
+    p.add_argument(
+        "--minutes", type=float, default=30.0, metavar="M", help="minutes of random commands per seed (default 30)"
+    )
     p.add_argument("--seeds", type=int, default=3, metavar="N", help="random walks (default 3)")
     p.add_argument("--repeats", type=int, default=5, metavar="N", help="measurements of speed (default 5, 0: none)")
     p.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default 1)")

@@ -1,9 +1,9 @@
-"""A full-size InternVL3-1B: Hugging Face `transformers` against our import of its file, in PyTorch and as fp32 graphs.
+"""Compares a full-size InternVL3-1B in `transformers` with this project's import, in PyTorch and as fp32 graphs.
 
     python -m tools.bench.parity_1b --json out/bench/parity_1b.json
 
-The weights are random (no checkpoint is downloaded) and bf16, saved by `save_pretrained` as any checkpoint is. Each
-network runs in a process of its own, one after the other, over the same prompt: frames, instruction, greedy answer.
+The weights are random (no checkpoint is downloaded) and bf16, saved by `save_pretrained`. Each network runs in a
+separate process, one after the other, on the same prompt: frames, instruction, greedy answer.
 The last-layer keys and values compared are those of the prompt. Exit code 1 when a bound is missed, 2 for bad input.
 """
 
@@ -43,7 +43,7 @@ Arrays = dict[str, npt.NDArray[Any]]
 
 COSINE, MAX_ABS = 0.99999, 1e-3
 LOGIT_POSITIONS = 64
-"""Positions at the prompt's end whose logits are compared: those of all would take 0.7 GB a network."""
+"""Number of positions at the prompt's end whose logits are compared: all would take 0.7 GB per network."""
 INSTRUCTION = "walk down the corridor, pass the vending machine and stop at the second door on the left"
 GRAPHS = ("vision_encoder", "language_model")
 
@@ -61,11 +61,11 @@ class Work:
 
     @property
     def config(self) -> TicVlaConfig:
-        """The network's numbers."""
+        """Configuration of the network."""
         return config_for(self.model)
 
     def prompt(self) -> tuple[npt.NDArray[np.uint8], list[int]]:
-        """Frames [F, px, px, 3] with edges and noise, and the ids of the runner's own prompt."""
+        """Build frames [F, px, px, 3] with edges and noise, and the ids of the runner's prompt."""
         config, rng = self.config, np.random.default_rng(self.seed)
         px = config.vision.image_px
         coarse = rng.integers(0, 256, (self.frames, 8, 8, 3))
@@ -83,7 +83,7 @@ class Work:
 
 
 def internvl_config(network: TicVlaConfig, *, tied: bool = False) -> Any:
-    """The configuration by which transformers builds our network."""
+    """Return the transformers configuration of the network."""
     from transformers import InternVLConfig
 
     v, c = network.vision, network.language
@@ -116,7 +116,7 @@ def internvl_config(network: TicVlaConfig, *, tied: bool = False) -> Any:
 
 
 def hugging_face(work: Work) -> Arrays:
-    """Make the checkpoint, then compute everything with transformers in fp32."""
+    """Write the checkpoint, then compute all outputs with transformers in fp32."""
     from transformers import InternVLForConditionalGeneration
 
     v = work.config.vision
@@ -125,12 +125,12 @@ def hugging_face(work: Work) -> Arrays:
     model = InternVLForConditionalGeneration(config).eval()
     with torch.no_grad():
         for name, parameter in model.named_parameters():
-            # transformers' own start values would make layers whisper, biases vanish and the text repeat one word.
+            # With transformers' initial values layers have little effect, biases are zero, the text repeats one word.
             if parameter.ndim == 1:
                 parameter.normal_(1.0 if "norm" in name and name.endswith("weight") else 0.0, 0.1)
             else:
                 parameter.normal_(0.0, 1.0 if "embed_tokens" in name else parameter[0].numel() ** -0.5)
-            # Parameters alone: the buffer of rotary frequencies is fp32 in every real run.
+            # Parameters only: the buffer of rotary frequencies is fp32 in every real run.
             parameter.data = parameter.data.bfloat16()
         model.save_pretrained(work.directory / "checkpoint")
         for parameter in model.parameters():
@@ -160,7 +160,7 @@ def hugging_face(work: Work) -> Arrays:
 
 
 def ours_in_torch(work: Work) -> Arrays:
-    """Import the checkpoint, write its graphs for `ours_as_graphs`, then compute everything with our network."""
+    """Import the checkpoint, write its graphs for `ours_as_graphs`, and compute all outputs in PyTorch."""
     model = load_checkpoint([work.directory / "checkpoint"], work.config, fill_seed=0).model
     for name in GRAPHS:
         write_graph(model, name, Precision("fp32"), "fused", work.directory)
@@ -185,7 +185,7 @@ def ours_in_torch(work: Work) -> Arrays:
 
 
 def ours_as_graphs(work: Work) -> Arrays:
-    """The same through ONNX Runtime; a graph gives the logits of its last position alone."""
+    """Compute the outputs with ONNX Runtime; a graph returns the logits of its last position only."""
     import onnxruntime as ort
 
     options = ort.SessionOptions()
@@ -231,7 +231,7 @@ STAGES: dict[str, Callable[[Work], Arrays]] = {
 
 
 def run_stage(name: str, work: Work) -> None:
-    """Compute in this process and leave the arrays, time and peak memory in the working directory."""
+    """Compute in this process and write arrays, time and peak memory to the working directory."""
     torch.set_num_threads(work.threads)
     started_ns = time.monotonic_ns()
     with torch.no_grad():
@@ -242,7 +242,7 @@ def run_stage(name: str, work: Work) -> None:
 
 
 def in_own_process(name: str, work: Work) -> dict[str, npt.NDArray[Any]]:
-    """`run_stage` in a fresh process, so that no network's memory is there twice; raises RuntimeError."""
+    """Run `run_stage` in a new process, so that only one network is in memory. Raises RuntimeError."""
     process = multiprocessing.get_context("spawn").Process(target=run_stage, args=(name, work))
     process.start()
     process.join()
@@ -253,7 +253,7 @@ def in_own_process(name: str, work: Work) -> dict[str, npt.NDArray[Any]]:
 
 
 def compare(theirs: Arrays, ours: Arrays) -> dict[str, Any]:
-    """Every measure, its bound and whether it is kept."""
+    """Compute every measure with its bound and whether it holds."""
     rows: dict[str, Any] = {}
     for name in ("visual_tokens", "last_layer_kv", "logits"):
         a, b = theirs[name], ours[name]
@@ -271,7 +271,7 @@ def compare(theirs: Arrays, ours: Arrays) -> dict[str, Any]:
 
 
 def show(result: dict[str, Any]) -> None:
-    """One table."""
+    """Print the result as a table."""
     networks = result["compared"]
     table = Table(title=f"{result['model']} against transformers {result['transformers']}")
     for heading in ("", "bound", *networks):
@@ -290,7 +290,7 @@ def show(result: dict[str, Any]) -> None:
 
 @command_line("parity_1b")
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     p = command_parser(__doc__)
     p.add_argument("--model", default="1b", help="1b, or a .json file with InternVL3's vocabulary")
     p.add_argument("--frames", type=int, default=4)

@@ -1,4 +1,4 @@
-"""Where a graph's time goes, operator by operator: ONNX Runtime's own profile of the artifacts on this machine.
+"""Prints a graph's time by operator: ONNX Runtime's profile of the artifacts on this machine.
 
 python -m tools.bench.profile --artifacts out/cpu --graphs language_model.decode --context 1100 --threads 2 --json -
 """
@@ -26,7 +26,7 @@ KERNEL = "_kernel_time"
 
 
 def feeds_for(artifacts: Artifacts, name: str, context: int) -> dict[str, Array]:
-    """Inputs of the shapes that a run meets: one token after `context` others for a decoder, 128 for a prefill."""
+    """Build inputs with the shapes of a run: one token after `context` others for a decoder, 128 for a prefill."""
     rng = np.random.default_rng(0)
     new = 128 if name == "language_model.prefill" else 1
     axes = {"S": new, "F": 1, "T": context, "C": artifacts.runtime.max_context}
@@ -43,7 +43,7 @@ def feeds_for(artifacts: Artifacts, name: str, context: int) -> dict[str, Array]
 
 
 def profile(artifacts: Artifacts, name: str, *, context: int, threads: int) -> dict[str, Any]:
-    """Milliseconds a call by operator, the largest first; the first call, which allocates, is not counted."""
+    """Measure the time per call by operator, ms, largest first; the first call, which allocates, is ignored."""
     contract = artifacts.graphs[name]
     calls = CALLS.get(name, 40)
     with tempfile.TemporaryDirectory() as folder:
@@ -88,7 +88,7 @@ def profile(artifacts: Artifacts, name: str, *, context: int, threads: int) -> d
 
 @command_line("profile")
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     p = command_parser(__doc__, artifacts=True)
     p.add_argument("--graphs", nargs="*", metavar="NAME", help="graphs to profile (default: all)")
     p.add_argument("--context", type=int, default=1100, help="tokens before the new one (default: 1100)")

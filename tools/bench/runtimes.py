@@ -1,12 +1,12 @@
-"""Our `cpu` artifacts against ONNX Runtime GenAI, OpenVINO, llama.cpp and PyTorch: same weights, shapes and threads.
+"""Compares `cpu` artifacts with ONNX Runtime GenAI, OpenVINO, llama.cpp, PyTorch: same weights, shapes, threads.
 
     python -m tools.bench.runtimes --artifacts DIR --out out/bench/runtimes --peers-venv DIR
 
 Shapes at full size: one 448² frame → 256 visual tokens; prefill of 1,100 tokens (ours: four frames' embeddings and 76
-text tokens; the peers: 1,100 ids, which spares them the gather); 32 decoded tokens on top; the action expert over 256
-visual and 1,132 semantic tokens. Ours takes the split step, the peers the whole action expert. Each contender is a
-process pinned to the same cores; in each round everybody is asked once while the others idle. Memory is that of a
-fresh process that opens its parts and computes each task once.
+text tokens; the peers: 1,100 ids, without the gather); then 32 decoded tokens; the action expert over 256 visual and
+1,132 semantic tokens. Ours runs the split step, the peers the whole action expert. Each contender is a process pinned
+to the same cores; in each round every contender runs once while the others idle. Memory is that of a new process that
+opens its parts and computes each task once.
 
 Writes samples.json, summary.md and the workers' logs. Exit code 0 when every bar that could be compared is reached, 1
 when one is not, 2 for bad input.
@@ -50,7 +50,7 @@ INSTALL = "tools/bench/peers/install.sh"
 
 
 class Bench:
-    """One benchmark: who takes part, where they live, what was found."""
+    """One benchmark: contenders, their environments and results."""
 
     def __init__(self, args: argparse.Namespace, model: str, contenders: Sequence[Contender]) -> None:
         self.args, self.model, self.contenders = args, model, list(contenders)
@@ -61,12 +61,12 @@ class Bench:
         self.rounds: list[Round] = []
 
     def failed(self, name: str, reason: str) -> None:
-        """Note that a contender is out, and why; the others go on."""
+        """Remove a contender with the reason; the others continue."""
         self.failures[name] = reason
         sys.stderr.write(f"left out: {reason}\n")
 
     def prepare(self) -> None:
-        """Have the peers' models made; raises WorkerError."""
+        """Build the peers' models. Raises WorkerError."""
         assets = sorted({asset for c in self.contenders for asset in c.assets})
         if not assets:
             return
@@ -81,7 +81,7 @@ class Bench:
             raise WorkerError(f"the peers' models cannot be made (code {code}); log: {log}")
 
     def worker(self, contender: Contender) -> Worker:
-        """The contender's process, not started."""
+        """Create the contender's process without starting it."""
         venv_python = self.args.peers_venv / "bin" / "python"
         python = Path(sys.executable) if contender.stack == OURS else venv_python
         log = self.args.out / "logs" / (contender.name.replace(" ", "-").replace("/", "-") + ".log")
@@ -89,7 +89,7 @@ class Bench:
         return Worker(contender.name, worker_command(python, contender.stack), self.cores, log)
 
     def load(self, contender: Contender, worker: Worker) -> list[str]:
-        """Have a worker open its parts; returns the tasks it can do; raises WorkerError."""
+        """Open a worker's parts; returns its tasks. Raises WorkerError."""
         options = dict(contender.options)
         if contender.stack == OURS:
             options = {"artifacts": str(self.args.artifacts.resolve())}
@@ -99,7 +99,7 @@ class Bench:
         return list(answer["tasks"])
 
     def measure_memory(self) -> None:
-        """Peak memory of every contender, each alone in a fresh process."""
+        """Measure the peak memory of every contender, each alone in a new process."""
         for contender in self.contenders:
             try:
                 with self.worker(contender) as worker, MemoryWatch(worker.pid) as watch:
@@ -112,7 +112,7 @@ class Bench:
                 sys.stderr.write(f"{contender.name}: peak {self.memory[contender.name].rss_mb:.0f} MB\n")
 
     def measure_time(self) -> None:
-        """Rounds of the control half, then of the language half: pairs never span the two."""
+        """Run rounds of the control tasks, then of the language tasks; pairs never mix the two."""
         for group in ("control", "language"):
             field = [
                 c
@@ -135,13 +135,13 @@ class Bench:
                     sys.stderr.write(f"{group} round {done.index + 1}: {state}, load {done.load_average[0]:.2f}\n")
 
     def counted(self, group: str) -> list[Round]:
-        """The quiet rounds of a group where there are enough of them, else all of it."""
+        """Return the quiet rounds of a group if there are enough, else all rounds."""
         rounds = [r for r in self.rounds if r.group == group]
         quiet = [r for r in rounds if r.quiet]
         return quiet if len(quiet) >= self.args.repeats else rounds
 
     def series(self) -> dict[str, dict[str, list[float]]]:
-        """Metric → contender → one value a counted round (those who did not last are left out)."""
+        """Return metric → contender → one value per counted round, without contenders that failed."""
         found: dict[str, dict[str, list[float]]] = {}
         for group in ("control", "language"):
             for sample in (s for r in self.counted(group) for s in r.samples if s.contender not in self.failures):
@@ -156,11 +156,11 @@ class Bench:
         return found
 
     def disturbed(self) -> int:
-        """Counted rounds in which other work ran."""
+        """Return the number of counted rounds in which other work ran."""
         return sum(not r.quiet for group in ("control", "language") for r in self.counted(group))
 
     def result(self, verdicts: Sequence[Verdict]) -> dict[str, Any]:
-        """Everything, for the JSON file."""
+        """Return the content of the JSON file."""
         return {
             "tagged": "measured",
             "machine": machine(),
@@ -200,7 +200,7 @@ def machine() -> dict[str, Any]:
 
 
 def notes(bench: Bench) -> list[str]:
-    """What a reader of the summary has to know."""
+    """Return the notes of the summary."""
     found = machine()
     counted = {group: len(bench.counted(group)) for group in ("control", "language")}
     return [
@@ -231,22 +231,24 @@ def show(verdicts: Sequence[Verdict]) -> None:
 
 
 def arguments(argv: list[str] | None) -> argparse.Namespace:
-    """The command line."""
+    """Parse the command line."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("--artifacts", type=Path, metavar="DIR", help="ours; without it only the peers are measured")
-    p.add_argument("--model", help="the peers' network when there are no artifacts to name it (default: 1b)")
+    p.add_argument(
+        "--artifacts", type=Path, metavar="DIR", help="artifacts to compare; without it only the peers are measured"
+    )
+    p.add_argument("--model", help="the peers' network without --artifacts (default: 1b)")
     p.add_argument("--out", type=Path, required=True, metavar="DIR")
     p.add_argument("--peers-venv", type=Path, default=Path("out/peers-venv"), metavar="DIR", help=f"made by {INSTALL}")
     p.add_argument("--cache", type=Path, default=Path("out/bench-peers"), metavar="DIR", help="the peers' models")
     p.add_argument("--repeats", type=int, default=7, help="quiet rounds (default: 7)")
     p.add_argument("--threads", type=int, default=2)
-    p.add_argument("--quiet-wait-s", type=float, default=60.0, help="wait this long for other work to end")
+    p.add_argument("--quiet-wait-s", type=float, default=60.0, help="longest wait for other work to end")
     p.add_argument("--only", nargs="+", default=[], metavar="NAME", help="contenders by name, * matches anything")
     return p.parse_args(argv)
 
 
 def checked(args: argparse.Namespace) -> Bench:
-    """The benchmark that the command line describes; raises ValueError or OSError with one clear line."""
+    """Create the benchmark of the command line. Raises ValueError or OSError with a one-line message."""
     cores = len(os.sched_getaffinity(0))
     if args.repeats < 1 or not 1 <= args.threads <= cores:
         raise ValueError(f"--repeats must be positive and --threads 1 to {cores}")
@@ -263,7 +265,7 @@ def checked(args: argparse.Namespace) -> Bench:
 
 @command_line("runtimes")
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     args = arguments(argv)
     try:
         bench = checked(args)
@@ -280,7 +282,7 @@ def main(argv: list[str] | None = None) -> int:
     print(f"{args.out / 'summary.md'} and samples.json written")
     reached = [v.reached for v in verdicts]
     if all(c.stack in OWN_STACK for c in bench.contenders):
-        return EXIT_DONE  # measured alone, as asked: there is no peer to compare with
+        return EXIT_DONE  # measured alone as requested: no peer to compare with
     return EXIT_DONE if True in reached and False not in reached else EXIT_CHECK_FAILED
 
 

@@ -1,9 +1,10 @@
-"""How soon the robot receives zero velocity when the runner is killed or frozen while it drives.
+"""Measures how soon the robot receives zero velocity after the runner is killed or frozen while driving.
 
     python -m tools.bench.stop --artifacts out/demo/artifacts --runs 20 --json out/bench/stop.json
 
-Real processes on loopback: edge-hil, edge-bridge, and an edge-run a time, which is sent SIGKILL or SIGSTOP in turn. The
-judge is the simulated robot's own trace of what it received: the figure is signal → first of the zeros that then last.
+Real processes on loopback: edge-hil, edge-bridge, and one edge-run per sample, which gets SIGKILL or SIGSTOP
+alternately. The figure is the time from the signal to the first zero command after which the robot receives only zeros,
+from the simulated robot's trace.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from tools.demo import INSTRUCTION
 SIGNALS = (signal.SIGKILL, signal.SIGSTOP)
 BOUND_MS = 300.0
 DRIVING_S = (0.5, 1.5)
-"""A run drives this long before the signal: the phase against the tick and the deadman is random."""
+"""Driving time before the signal, s; its phase to tick and deadman is random."""
 AFTERMATH_S = 0.8
 
 
@@ -34,7 +35,7 @@ Moves = list[tuple[int, tuple[float, float, float]]]
 
 
 def received_moves(trace: Path) -> Moves:
-    """(stamp ns, velocity) of every Move in a trace of edge-hil, an unfinished last line left out."""
+    """Return (stamp ns, velocity) of every Move in a trace of edge-hil; ignores an incomplete last line."""
     moves: Moves = []
     for line in trace.read_text(encoding="utf-8").split("\n")[:-1]:
         record = json.loads(line)
@@ -45,7 +46,7 @@ def received_moves(trace: Path) -> Moves:
 
 
 def lasting_zero_ms(moves: Moves, signal_ns: int) -> float:
-    """From the signal to the zero after which nothing but zero came; raises ValueError when there was none."""
+    """Return the time from the signal to the lasting zero, ms. Raises ValueError if there is none."""
     after = [move for move in moves if move[0] >= signal_ns]
     last_motion = max((i for i, (_, velocity) in enumerate(after) if any(velocity)), default=-1)
     if last_motion + 1 >= len(after):
@@ -54,7 +55,7 @@ def lasting_zero_ms(moves: Moves, signal_ns: int) -> float:
 
 
 def start_robot(children: Children, folder: Path, options: Sequence[str] = ()) -> list[str]:
-    """Start edge-hil with its options and edge-bridge; returns the arguments by which a runner finds them."""
+    """Start edge-hil with its options and edge-bridge; returns the runner's arguments to reach them."""
     domain = ["--domain", str(free_domain())]
     link = ["--robot", str(ROBOT_FILE), "--socket", str(folder / "b.sock"), *domain]
     scene = ["--robot", "go2", "--scene", "corridor", "--protocol", "unitree", "--people", "0"]
@@ -85,7 +86,7 @@ def stop_once(children: Children, runner: list[str], trace: Path, number: signal
 
 @command_line("stop")
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     p = command_parser(__doc__, artifacts=True)
     p.add_argument("--runs", type=int, default=20, help="runs of each signal (default: 20)")
     args = p.parse_args(argv)

@@ -2,8 +2,8 @@
 
     python -m tools.bench.tick --artifacts out/demo/artifacts --json out/bench/tick.json
 
-Prints medians and the ratio; the JSON holds every sample. The two take turns, so that a machine that slows down slows
-both. `--core` pins the process, which makes "one core" literal.
+Prints medians and the ratio; the JSON has every sample. The two alternate, so that a slower machine affects both.
+`--core` pins the process to one core.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ HERE = SE2(0.0, 0.0, 0.0)
 
 
 def onnx_tick(directory: Path, image: NDArray[np.uint8], kv: NDArray[np.float32]) -> Callable[[], NDArray[np.float32]]:
-    """The runner's own code path."""
+    """Return the tick of the runner's code."""
     policy = Policy(load_artifacts(directory), threads=1)
     semantic = SemanticState(0, 0, HERE, 0, kv, policy.semantic_context(kv), "", None)
     return lambda: policy.act(policy.encode(image), (0.4, 0.0, 0.0), 2.0, HERE, semantic)
 
 
 def torch_tick(model_name: str, image: NDArray[np.uint8], kv: NDArray[np.float32]) -> Callable[[], NDArray[np.float32]]:
-    """The same network in PyTorch eager mode on one thread."""
+    """Return the tick of the same network in eager PyTorch on one thread."""
     torch.set_num_threads(1)
     model = build(config_for(model_name), 0)
     frame, state, latency = torch.from_numpy(image), torch.tensor([[0.4, 0.0, 0.0]]), torch.tensor([[2.0, 0, 0, 0]])
@@ -58,7 +58,7 @@ def torch_tick(model_name: str, image: NDArray[np.uint8], kv: NDArray[np.float32
 
 @command_line("tick")
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     p = command_parser(__doc__, artifacts=True)
     p.add_argument("--rounds", type=int, default=100)
     p.add_argument("--tokens", type=int, default=200, help="tokens of the semantic state (default: 200)")

@@ -1,7 +1,7 @@
 """Inject every fault into real processes on loopback and measure, on the robot's side, how soon the robot stops.
 
-edge-hil, edge-bridge and edge-run run as a user would start them (edge-run with a plan that keeps the robot moving, and
-with switches for faults inside it). The judge is a sniffer, a process of its own that stamps what reaches the robot.
+edge-hil, edge-bridge and edge-run run as a user would start them; edge-run has a plan that keeps the robot moving, and
+switches for internal faults. A sniffer, a separate process, stamps every request that reaches the robot.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ EXAMPLES = """examples:
   python -m tools.faults --artifacts out/nano --out out/faults
   python -m tools.faults --artifacts out/nano --out out/faults --rows "camera*" --rows "runner SIG*" --per-row 20
   python -m tools.faults --list
-exit codes: 0 every bound held, 1 one did not or an injection failed, 2 bad arguments, 130 interrupted"""
+exit codes: 0 every bound held, 1 a bound did not hold or an injection failed, 2 bad arguments, 130 interrupted"""
 
 
 def parser() -> argparse.ArgumentParser:
-    """Command line."""
+    """Return the argument parser."""
     p = argparse.ArgumentParser(
         "python -m tools.faults",
         description=__doc__,
@@ -62,29 +62,29 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--per-row", type=int, default=5, metavar="N", help="injections a row; slow rows get fewer (default: 5)"
     )
-    p.add_argument("--seed", type=int, default=0, help="of the moments of injection (default: 0)")
+    p.add_argument("--seed", type=int, default=0, help="seed of the injection times (default: 0)")
     p.add_argument("--domain", type=int, metavar="N", help="DDS domain (default: a free one)")
-    p.add_argument("--list", action="store_true", help="print the rows and what they are judged by, then end")
-    p.add_argument("--json", metavar="FILE|-", help="also write the result here; - is stdout")
+    p.add_argument("--list", action="store_true", help="print the rows with their criteria and exit")
+    p.add_argument("--json", metavar="FILE|-", help="also write the result to this file; - is stdout")
     return p
 
 
 def chosen(globs: Sequence[str] | None) -> list[Row]:
-    """Rows whose names match; ValueError when a pattern matches none."""
+    """Return the rows whose names match. Raises ValueError if a pattern matches none."""
     everything = rows()
     for glob in globs or ():
         if not any(fnmatch.fnmatch(row.name, glob) for row in everything):
-            raise ValueError(f"--rows {glob!r}: no such row; --list shows them")
+            raise ValueError(f"--rows {glob!r}: no such row; see --list")
     return [row for row in everything if not globs or any(fnmatch.fnmatch(row.name, glob) for glob in globs)]
 
 
 def count(row: Row, per_row: int) -> int:
-    """Injections of a row."""
+    """Return the number of injections of a row."""
     return max(1, round(row.share * per_row))
 
 
 def run_row(rig: Rig, row: Row, times: int, rng: random.Random, host: HostStall) -> RowResult:
-    """All injections of one row. Raises FaultError when the robot's side does not answer."""
+    """Make all injections of one row. Raises FaultError if the robot's side does not answer."""
     samples: list[Sample] = []
     repeated = 0
     for index in range(times):
@@ -102,15 +102,15 @@ def run_row(rig: Rig, row: Row, times: int, rng: random.Random, host: HostStall)
 
 
 def attempt(rig: Rig, row: Row, rng: random.Random, host: HostStall) -> Sample:
-    """One injection, and then the row's own pause."""
+    """Make one injection, then wait for the row's pause."""
     begun_ns = time.monotonic_ns()
     try:
         sample = injection(rig, row, rng, host)
     except (FaultError, StepError) as error:
-        # A fault without effect or a runner that did not drive fails this injection only.
+        # A fault without effect or a runner that does not drive fails only this injection.
         sample = Sample(None, 0.0, [str(error).splitlines()[0]])
         rig.kill_runner()
-        rig.clear()  # raises if edge-hil has ended, which ends everything
+        rig.clear()  # raises if edge-hil has ended, which ends the whole run
     time.sleep(max(0.0, row.spacing_s - (time.monotonic_ns() - begun_ns) / 1e9))
     return sample
 
@@ -158,7 +158,7 @@ def keep_logs(folder: Path, out: Path) -> None:
 
 @command_line("faults")
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     args = parser().parse_args(argv)
     try:
         wanted = chosen(args.rows)
@@ -179,7 +179,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         results = run(args, wanted)
     except KeyboardInterrupt:
-        _print(f"interrupted, all processes ended; what was measured is in {args.out}")
+        _print(f"interrupted, all processes ended; the results so far are in {args.out}")
         return EXIT_INTERRUPTED
     except (StepError, FaultError, OSError) as error:
         _print(str(error))

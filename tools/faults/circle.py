@@ -1,6 +1,6 @@
-"""The plan that the fault harness drives by: a circle around where the robot's odometry began. Pure.
+"""Plan of the fault harness: a circle around the odometry's origin. Pure.
 
-Untrained weights walk a robot into a wall, where it can show nothing; on a circle it moves for ever in a small place.
+Untrained weights would walk the robot into a wall; on a circle it moves without end in a small area.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy.typing as npt
 from edge.core.geometry import SE2, wrap_angle
 
 SPEED_MPS = 0.7
-"""Above half of the robot file's limit, so that a halved limit shows."""
+"""Speed above half of the robot file's limit, so that a halved limit has an effect, m/s."""
 RADIUS_M = 1.0
 MAX_TURN_RADPS = 0.95
 _STEER_PER_S = 1.5
@@ -24,9 +24,9 @@ _SLOW_DOWN = 1.2  # full speed as long as the heading is within 34 degrees
 
 
 def steering(T_odom_base: SE2) -> tuple[float, float]:
-    """Speed (m/s) and yaw rate (rad/s) that lead onto the circle, counter-clockwise, from anywhere.
+    """Compute speed (m/s) and yaw rate (rad/s) towards the circle, counter-clockwise, from any pose.
 
-    A robot with the wrong heading turns nearly on the spot, so that it stays within the small place.
+    A robot with the wrong heading turns nearly on the spot, so that it stays within the area.
     """
     radius_m = math.hypot(T_odom_base.x_m, T_odom_base.y_m)
     tangent_rad = math.atan2(T_odom_base.y_m, T_odom_base.x_m) + math.pi / 2
@@ -38,9 +38,9 @@ def steering(T_odom_base: SE2) -> tuple[float, float]:
 
 
 def plan(T_odom_base: SE2, steps: int, step_s: float, phase_rad: float) -> npt.NDArray[np.float32]:
-    """Trajectory [steps, 3] in the robot frame: an arc at constant speed, which ripples a little with `phase_rad`.
+    """Plan a trajectory [steps, 3] in the robot frame: an arc at constant speed with a small ripple by `phase_rad`.
 
-    Without the ripple a robot that has found its circle would plan the same for ever, as a dead network does.
+    Without the ripple all plans on the circle would be equal, which the monitors take for a dead network.
     """
     speed, turn = steering(T_odom_base)
     speed *= 1.0 + _RIPPLE * math.sin(phase_rad)

@@ -1,11 +1,10 @@
-"""edge-run with a plan that keeps the robot moving, and with faults that can be switched on inside it.
+"""Runs edge-run with a plan that keeps the robot moving, and with internal faults that can be switched on.
 
     python -m tools.faults.faulty_runner SOCKET --artifacts DIR --robot FILE.toml --instruction TEXT ...
 
-The product has no hook for faults: this program replaces methods of its classes in its own process and then calls the
-unchanged `edge.run.command.main` with the arguments after SOCKET. Besides, untrained weights pass for trained ones: the
-plan that `Policy.act` returns (`circle.py`) and the language model's text are exchanged for what those would give. Both
-networks run all the same.
+The product has no hook for faults: this program replaces methods in its own process and then calls the unchanged
+`edge.run.command.main` with the arguments after SOCKET. It also replaces the plan of `Policy.act` (`circle.py`) and the
+language model's text, so that untrained weights behave like trained ones. Both networks still run.
 """
 
 from __future__ import annotations
@@ -36,33 +35,33 @@ from tools.faults import circle
 from tools.faults.switches import Switches
 
 STEP_S = 0.1
-# Untrained weights write no waypoints, and answers without any are a fault of their own.
+# Untrained weights write no waypoints, and a text without waypoints is a fault.
 VALID_TEXT = format_waypoints(((1.0, 0.0), (2.0, 0.0), (3.0, 0.0)))
 _RIPPLE_RAD_PER_CALL = 0.7
 _HANG_POLL_S = 0.02
 
 FAULTS: Mapping[str, str] = {
-    "control-death": "the next call of the action expert raises what nobody expects",
-    "control-hang": "the action expert does not come back for seconds_s",
-    "tick-slow": "the action expert takes seconds_s more, each time",
+    "control-death": "the next call of the action expert raises an unexpected exception",
+    "control-hang": "the action expert does not return for seconds_s",
+    "tick-slow": "each call of the action expert takes seconds_s longer",
     "act-error": "the action expert's graph fails",
     "encoder-error": "the encoder's graph fails",
     "nan-output": "the plan is not a number",
     "scaled-output": "the plan is `factor` times as long",
-    "constant-output": "the plan stays what it is",
+    "constant-output": "the plan stays the same",
     "oscillating-output": "the plan turns hard to the other side at every tick",
-    "reasoning-death": "the language model raises what nobody expects",
-    "reasoning-hang": "the language model does not come back",
+    "reasoning-death": "the language model raises an unexpected exception",
+    "reasoning-hang": "the language model does not return",
     "reasoning-error": "the language model's graph fails",
     "garbage-text": "the language model's answer is the parameter text",
-    "disk-full": "the flight log's disk takes no more",
-    "disk-stall": "the flight log's disk takes seconds_s for each write",
+    "disk-full": "the flight log's disk is full",
+    "disk-stall": "each write of the flight log takes seconds_s",
     "wall-clock": "the date jumps by seconds_s",
 }
 
 
 class UnexpectedError(Exception):
-    """A defect that no code of the runner knows."""
+    """Exception that no code of the runner handles."""
 
 
 def _trained(original: Callable[..., Any]) -> Callable[..., Any]:
@@ -73,7 +72,7 @@ def _trained(original: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _replace(owner: object, name: str, wrapped: Callable[[Callable[..., Any]], Callable[..., Any]]) -> None:
-    """Put a wrapper in the place of a function; raises AttributeError where there is none of that name."""
+    """Replace a function by a wrapper. Raises AttributeError if it does not exist."""
     setattr(owner, name, wrapped(getattr(owner, name)))
 
 
@@ -82,7 +81,7 @@ def _seconds(values: Mapping[str, Any], default: float) -> float:
 
 
 class Faults:
-    """Wraps the runner's methods; `Switches` says which fault is on."""
+    """Wraps the runner's methods; `Switches` has the active faults."""
 
     def __init__(self, switches: Switches) -> None:
         self._on = switches.hit
@@ -98,7 +97,7 @@ class Faults:
         _replace(runner, "load_artifacts", _trained)
         _replace(PartFile, "write", self._disk)
         _replace(PartFile, "sync", self._disk)
-        time.time = self._clock(time.time)  # noqa: TID251 - the very thing that must not matter
+        time.time = self._clock(time.time)  # noqa: TID251 - a jump of the date must have no effect
 
     def _act(self, original: Callable[..., Any]) -> Callable[..., Any]:
         signature = inspect.signature(original)
@@ -184,7 +183,7 @@ class Faults:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Install the faults and run."""
+    """Install the faults and run edge-run."""
     arguments = sys.argv[1:] if argv is None else argv
     if not arguments or arguments[0].startswith("-"):
         sys.stderr.write("faulty_runner: expected a path for the fault socket, then the arguments of edge-run\n")

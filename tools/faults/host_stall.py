@@ -1,4 +1,4 @@
-"""How long the machine itself stood still: what a bound in milliseconds on other processes is worth on a shared one."""
+"""Measures how long a shared machine stalls, which limits the accuracy of a bound on other processes."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import time
 from collections import deque
 
 _SLEEP_S = 0.001
-_STALL_NS = 5_000_000  # a 1 ms sleep that takes longer was not woken in time: the machine was busy elsewhere
+_STALL_NS = 5_000_000  # a 1 ms sleep that takes longer: the machine did not run this thread in time
 _KEEP = 10_000
 
 
 class HostStall:
-    """How long this machine kept a thread waiting that asked for 1 ms, over and over; a context manager.
+    """Context manager that measures the delays of repeated 1 ms sleeps.
 
-    A bound in milliseconds on other processes means what it says only as far as the machine lets anybody run.
+    A bound in milliseconds on other processes is meaningful only if the machine schedules processes in time.
     """
 
     def __init__(self) -> None:
@@ -31,11 +31,11 @@ class HostStall:
         self._thread.join()
 
     def add(self, due_ns: int, woken_ns: int) -> None:
-        """Note a sleep that ended at `woken_ns` instead of `due_ns`."""
+        """Record a sleep that ended at `woken_ns` instead of `due_ns`."""
         self._stalls.append((due_ns, woken_ns))
 
     def between_ns(self, begin_ns: int, end_ns: int) -> int:
-        """Sum of the stalls inside a window, 0 on a machine with time to spare."""
+        """Return the sum of the stalls inside a window, ns; 0 on an idle machine."""
         return sum(max(min(late, end_ns) - max(due, begin_ns), 0) for due, late in list(self._stalls))
 
     def _watch(self) -> None:

@@ -34,15 +34,15 @@ class Sample:
 
     latency_ms: float | None
     stall_ms: float
-    """Part of that time in which the machine itself stood still."""
+    """Part of that time in which the machine stalled, ms."""
     wrong: list[str] = field(default_factory=list)
     """Other failures."""
     hindered: list[str] = field(default_factory=list)
-    """Why the robot did not drive where it may. A busy machine can cause that too, so the injection is repeated."""
+    """Reason why the robot did not drive although permitted; a busy machine can cause it, so it is repeated."""
 
 
 def injection(rig: Rig, row: Row, rng: random.Random, host: HostStall) -> Sample:
-    """Make one injection. Raises StepError or FaultError when the rig itself does not work."""
+    """Make one injection. Raises StepError or FaultError if the rig does not work."""
     rig.ensure_moving()
     time.sleep(rng.uniform(0.0, PHASE_S))
     before_ns = time.monotonic_ns()
@@ -89,7 +89,7 @@ def _first(rig: Rig, row: Row, effect_ns: int, commanders: frozenset[int]) -> in
 
 
 def _unchanged(rig: Rig, effect_ns: int, host: HostStall) -> Sample:
-    """Watch that the commands continue and that none is zero or slower."""
+    """Check that the commands continue and that none is zero or slower."""
     before_mps = rig.speed_mps()
     time.sleep(max(0.0, WATCH_S - (time.monotonic_ns() - effect_ns) / 1e9))
     end_ns = effect_ns + round(WATCH_S * 1e9)
@@ -104,7 +104,7 @@ def _unchanged(rig: Rig, effect_ns: int, host: HostStall) -> Sample:
 
 
 def _aftermath(rig: Rig, row: Row, sample: Sample, commanders: frozenset[int]) -> None:
-    """End the fault and check how the robot goes on."""
+    """End the fault and check the robot's behaviour afterwards."""
     if row.thaw:
         rig.send(rig.runner, signal.SIGCONT)
         _stays(rig, sample, commanders, "moved after SIGCONT")

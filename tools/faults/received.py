@@ -1,4 +1,4 @@
-"""Requests that the sniffer has received, and pure functions that judge the commands among them."""
+"""Requests received by the sniffer, and pure functions that judge the commands among them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ KEEP_NS = 120_000_000_000
 
 @dataclass(frozen=True)
 class ReceivedCommand:
-    """One request of the sport service; `velocity` of a Move."""
+    """Request of the sport service; `velocity` only for a Move."""
 
     t_ns: int
     source: int
@@ -26,12 +26,12 @@ class ReceivedCommand:
 
     @property
     def moving(self) -> bool:
-        """A Move that is not zero."""
+        """Whether it is a Move other than zero."""
         return self.velocity is not None and any(self.velocity)
 
 
 class ReceivedCommands:
-    """The requests that the sniffer has received in the last two minutes."""
+    """Requests received by the sniffer in the last two minutes."""
 
     def __init__(self, path: Path) -> None:
         self._tail = LineTail(path)
@@ -49,31 +49,31 @@ class ReceivedCommands:
             self._requests.popleft()
 
     def since(self, t_ns: int) -> list[ReceivedCommand]:
-        """Requests from `t_ns` on."""
+        """Return the requests from `t_ns` on."""
         self.update()
         return [request for request in self._requests if request.t_ns >= t_ns]
 
     def sources(self) -> frozenset[int]:
-        """Sources of the requests of the last two minutes."""
+        """Return the sources of the requests of the last two minutes."""
         self.update()
         return frozenset(request.source for request in self._requests)
 
     def last_moves(self, count: int) -> list[ReceivedCommand]:
-        """The newest Moves, oldest first."""
+        """Return the newest Moves, oldest first."""
         self.update()
         moves = [request for request in self._requests if request.velocity is not None]
         return moves[-count:]
 
 
 def moves(requests: Iterable[ReceivedCommand]) -> list[tuple[int, Velocity]]:
-    """(ns, velocity) of every Move."""
+    """Return (ns, velocity) of every Move."""
     return [(one.t_ns, one.velocity) for one in requests if one.api_id == ids.MOVE and one.velocity is not None]
 
 
 def first_lasting(stamped: Sequence[tuple[int, Velocity]], limit: Velocity) -> int | None:
-    """Stamp of the first of the commands at the end that are all within `limit`, ns; None when the last is not.
+    """Return the stamp from which all further commands are within `limit`, ns; None if the last one is not.
 
-    `limit` bounds the size of each component; all zero: only zero is within it.
+    `limit` bounds the absolute value of each component; with zeros only zero is within it.
     """
     first = None
     for t_ns, velocity in stamped:
@@ -85,6 +85,6 @@ def first_lasting(stamped: Sequence[tuple[int, Velocity]], limit: Velocity) -> i
 
 
 def longest_gap_ms(stamped: Sequence[tuple[int, Velocity]], begin_ns: int, end_ns: int) -> float:
-    """Longest time in a window without a command, both ends included."""
+    """Return the longest time without a command in a window, including both ends, ms."""
     stamps = [begin_ns, *(t_ns for t_ns, _ in stamped if begin_ns <= t_ns <= end_ns), end_ns]
     return max(b - a for a, b in itertools.pairwise(stamps)) / 1e6

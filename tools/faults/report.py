@@ -23,11 +23,11 @@ _WHAT = {
 
 @dataclass(frozen=True)
 class RowResult:
-    """One row's samples and their verdict.
+    """Samples of one row and their verdict.
 
-    A bound holds when the 99.9th percentile is within it, no sample is above twice it, every sample came at all and
-    nothing else was wrong. The time in which the machine itself stood still is granted and counted, as is an injection
-    that was `repeated` because the robot did not drive where it may.
+    A bound holds if the 99.9th percentile is within it, no sample exceeds twice the bound, every sample has a reaction
+    and there is no other problem. Stalls of the machine are subtracted and counted. An injection is `repeated` and
+    counted if the robot did not drive although permitted.
     """
 
     row: Row
@@ -41,13 +41,13 @@ class RowResult:
 
     @property
     def granted(self) -> int:
-        """Number of samples above the bound by no more than the machine stood still."""
+        """Number of samples that exceed the bound by no more than the machine's stall."""
         bound = self.row.bound_ms
         return sum(1 for s in self.samples if s.latency_ms is not None and bound < s.latency_ms <= bound + s.stall_ms)
 
     @property
     def problems(self) -> list[str]:
-        """Reasons why the row has failed; empty if it has passed."""
+        """Reasons for the row's failure; empty if it passed."""
         if not self.samples:
             return ["no injection"]
         bound = self.row.bound_ms
@@ -62,7 +62,7 @@ class RowResult:
         return found + sorted({wrong for sample in self.samples for wrong in sample.wrong})
 
     def as_json(self) -> dict[str, Any]:
-        """For the result file, raw samples included."""
+        """Return the entry of the result file, including raw samples."""
         values = self.latencies_ms
         return {
             "fault": self.row.fault,
@@ -86,7 +86,7 @@ def percentile(values: Sequence[float], share: float) -> float:
 
 
 def result(rows: Sequence[RowResult], machine: Mapping[str, object]) -> dict[str, Any]:
-    """The JSON result."""
+    """Return the JSON result."""
     return {
         "injections": sum(len(row.samples) for row in rows),
         "pass": bool(rows) and all(not row.problems for row in rows),
@@ -98,7 +98,7 @@ def result(rows: Sequence[RowResult], machine: Mapping[str, object]) -> dict[str
 
 def show(rows: Sequence[RowResult], console: Console) -> None:
     """Print the table: times in ms from the fault's effect to the judged event, as the sniffer received it."""
-    table = Table(title="Faults: from effect to what is judged, ms, received on the robot's side", title_justify="left")
+    table = Table(title="Faults: from effect to judged event, ms, received on the robot's side", title_justify="left")
     table.add_column("injected")
     table.add_column("fault of the table")
     table.add_column("judged")

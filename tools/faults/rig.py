@@ -1,4 +1,4 @@
-"""The rig: robot's side, sniffer, bridge and runner as real processes on loopback, and what a fault needs of them."""
+"""Rig of robot's side, sniffer, bridge and runner as real processes on loopback, with the operations of the faults."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ def _has_printed(child: Child, text: str) -> bool:
 
 
 class Rig:
-    """The processes of one DDS domain; a context manager that ends exactly those it started."""
+    """Processes of one DDS domain; the context manager ends only processes that it started."""
 
     def __init__(
-        self, folder: Path, artifacts: Path, domain: int, say: Callable[[str], None], *, record: bool = True
+        self, folder: Path, artifacts: Path, domain: int, log: Callable[[str], None], *, record: bool = True
     ) -> None:
-        """Put sockets and logs into `folder`, whose path must be short: a socket's has at most 107 bytes."""
+        """Create the rig with sockets and logs in `folder`; a socket's path has at most 107 bytes."""
         self.folder = folder
         self.domain = domain
         self.received = ReceivedCommands(folder / "received.jsonl")
@@ -50,7 +50,7 @@ class Rig:
         self.needs_operator = False
         self._artifacts = artifacts
         self._record = record
-        self._say = say
+        self._log = log
         self._children = Children(folder, grace_s=5.0)
         self._trace = LineTail(folder / "trace.jsonl")
         self._commanded: list[tuple[int, bool]] = []
@@ -76,7 +76,7 @@ class Rig:
 
     @property
     def inside(self) -> FaultClient:
-        """Client of the faults inside the runner."""
+        """Client that switches the runner's internal faults."""
         assert self._inside is not None
         return self._inside
 
@@ -129,21 +129,21 @@ class Rig:
             self._wait(partial(self._moving_or_ended, runner), MOVING_TIMEOUT_S, runner, "motion")
             if runner.running:
                 return
-            self._say(f"the runner ended before it was asked to: {last_line(runner)}")
-        raise StepError(f"the runner ended {_ATTEMPTS} times before it was asked to: {last_line(runner)}")
+            self._log(f"the runner ended too early: {last_line(runner)}")
+        raise StepError(f"the runner ended {_ATTEMPTS} times too early: {last_line(runner)}")
 
     def _moving_or_ended(self, runner: Child) -> bool:
         return self.moving() or not runner.running
 
     def moving(self) -> bool:
-        """Whether the newest commands are all near full speed, and fresh."""
+        """Return whether the newest commands are recent and near full speed."""
         last = self.received.last_moves(_STEADY_MOVES)
         fresh = bool(last) and time.monotonic_ns() - last[-1].t_ns < 200_000_000
         fast = [one.velocity is not None and one.velocity[0] >= _STEADY_SHARE * SPEED_MPS for one in last]
         return fresh and len(last) == _STEADY_MOVES and all(fast)
 
     def drives_on(self, timeout_s: float) -> bool:
-        """Wait for motion at any speed without starting anything; False when it did not come."""
+        """Wait for motion at any speed, without starting a process; returns False without motion."""
         deadline_ns = time.monotonic_ns() + round(timeout_s * 1e9)
         while not all(one.moving for one in self.received.last_moves(_STEADY_MOVES)):
             gone = self.runner is None or not self.runner.running
@@ -153,11 +153,11 @@ class Rig:
         return True
 
     def speed_mps(self) -> float:
-        """Median forward speed commanded lately."""
+        """Return the median forward speed of the newest commands, m/s."""
         return statistics.median(abs(one.velocity[0]) for one in self.received.last_moves(25) if one.velocity)
 
     def send(self, child: Child | None, number: signal.Signals) -> int:
-        """Send a signal; returns when, monotonic ns."""
+        """Send a signal; returns its time, monotonic ns."""
         assert child is not None
         now_ns = time.monotonic_ns()
         child.process.send_signal(number)
@@ -179,7 +179,7 @@ class Rig:
         self.bridge = None
 
     def _operator_arms(self) -> None:
-        """Permit the waiting runner to arm, as an operator does it. Raises StepError."""
+        """Permit the waiting runner to arm, as an operator does. Raises StepError."""
         command = [*COMMANDS["edge-bridge"], "arm", "--robot", str(ROBOT_FILE), "--socket", str(self.folder / "b.sock")]
         done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
         if done.returncode != 0:
@@ -193,7 +193,7 @@ class Rig:
             log.unlink(missing_ok=True)
 
     def rogue(self, duration_s: float) -> int:
-        """Let a second commander drive for `duration_s`, or a little longer; returns when it began, ns."""
+        """Let a second commander drive for `duration_s` or slightly longer; returns its start, ns."""
         command = [sys.executable, "-m", "tools.faults.rogue", "--domain", str(self.domain)]
         rogue = self._children.start("rogue", [*command, "--duration", str(duration_s)])
         try:
@@ -212,7 +212,7 @@ class Rig:
         time.sleep(_COMMANDER_S)
 
     def robot_obeys_motion(self) -> list[tuple[int, bool]]:
-        """(ns, whether) of each change of the robot's own commanded velocity from or to zero, from its trace."""
+        """Return (ns, moving) for each change of the robot's commanded velocity from or to zero, from its trace."""
         for line in self._trace.lines():
             if line["kind"] == "commanded":
                 velocity = line["velocity"]
@@ -248,7 +248,7 @@ class Rig:
 
 
 def _asks_or_ended(runner: Child) -> bool:
-    """Whether a runner waits for an operator's arm or has ended."""
+    """Return whether a runner waits for an operator's arming or has ended."""
     return "waiting for `edge-bridge arm`" in runner.log.read_text() or not runner.running
 
 

@@ -1,4 +1,4 @@
-"""A second commander: sends Moves to the robot beside the bridge, as another program or the maker's app would.
+"""Second commander: sends Moves to the robot beside the bridge, like another program or the manufacturer's app.
 
     python -m tools.faults.rogue --domain 7 --duration 1
 
@@ -23,12 +23,14 @@ _RATE_HZ = 10.0
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Send, then end."""
+    """Send Moves for the duration, then exit."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--domain", type=int, required=True)
     parser.add_argument("--duration", type=float, default=1.0, help="s (default: 1)")
     args = parser.parse_args(argv)
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR1})  # DDS's threads inherit it: only sigwait takes it
+    signal.pthread_sigmask(
+        signal.SIG_BLOCK, {signal.SIGUSR1}
+    )  # DDS's threads inherit the mask, so only sigwait receives the signal
     bus = Bus(DdsConfig(args.domain, "lo", ("127.0.0.1",)))
     sport = RpcClient(bus, ids.SPORT_SERVICE)
     deadline_ns = time.monotonic_ns() + round(_FIND_TIMEOUT_S * 1e9)

@@ -1,4 +1,4 @@
-"""Rows of `make faults`: the fault of the table, how it is injected, and the required reaction."""
+"""Rows of `make faults`: fault of the table, injection, required reaction."""
 
 from __future__ import annotations
 
@@ -21,40 +21,40 @@ SCENE_MS = 1000
 
 
 class Judge(Enum):
-    """Quantity by which a row is judged."""
+    """Criterion of a row."""
 
     ZERO = "zero"
     """Time to the lasting zero velocity."""
     LIMIT = "limit"
     """Time to commands that stay within the limit's share of the speed limit."""
     ROBOT = "robot"
-    """Time until the robot itself obeys no velocity any more."""
+    """Time until the robot obeys no velocity."""
     UNCHANGED = "unchanged"
-    """The longest time without a moving command, while nothing else may change."""
+    """Longest time without a moving command; nothing else may change."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One kind of injection. `inject` returns the ns of the effect; `undo` makes it good again."""
+    """One kind of injection. `inject` returns the time of the effect, ns; `undo` ends it."""
 
     name: str
     fault: str | None
     inject: Callable[[Rig], int]
     undo: Callable[[Rig], None] | None = None
     judge: Judge | None = None
-    """None: what the fault's action says."""
+    """None: derived from the fault's action."""
     bound: float | None = None
-    """None: the fault's own, ms."""
+    """Bound, ms; None: the fault's."""
     share: float = 1.0
-    """Of --per-row: slow injections are made less often."""
+    """Share of --per-row; slow injections are made less often."""
     ends_run: bool = False
-    """Beyond a latching fault's own end of the run: a new runner is started after it."""
+    """Whether the run ends and a new runner is started, even if the fault does not latch."""
     spacing_s: float = 0.0
-    """Time between two injections, for faults that escalate when they come again."""
+    """Time between two injections, for faults that escalate when repeated, s."""
     operator_arms: bool = False
-    """Afterwards an operator has to permit the next runner to arm (`edge-bridge arm`)."""
+    """Whether an operator must then permit the next runner to arm (`edge-bridge arm`)."""
     thaw: bool = False
-    """Afterwards SIGCONT to the runner, which must not move the robot."""
+    """Whether to send SIGCONT to the runner afterwards, which must not move the robot."""
 
     def __post_init__(self) -> None:
         if self.fault is None and self.judge is None:
@@ -64,7 +64,7 @@ class Row:
 
     @property
     def judged_by(self) -> Judge:
-        """The judge given, or the one that fits the fault's action."""
+        """The given judge, or the one of the fault's action."""
         if self.judge is not None:
             return self.judge
         assert self.fault is not None
@@ -77,7 +77,7 @@ class Row:
 
     @property
     def bound_ms(self) -> float:
-        """From effect to what is judged; for UNCHANGED the longest gap between two commands."""
+        """Longest time from the effect to the judged event, ms; for UNCHANGED the longest gap between two commands."""
         if self.bound is not None:
             return self.bound
         if self.judged_by is Judge.UNCHANGED:
@@ -86,59 +86,59 @@ class Row:
 
     @property
     def speed_scale(self) -> float:
-        """Share of the speed limit that a limiting fault leaves."""
+        """Remaining share of the speed limit under a limiting fault."""
         return FAULTS[self.fault].speed_scale if self.fault is not None else 1.0
 
     @property
     def kills_bridge(self) -> bool:
-        """Whether the bridge is gone or hangs after it."""
+        """Whether the bridge has ended or hangs afterwards."""
         return self.name.startswith("bridge ")
 
     @property
     def latches(self) -> bool:
-        """Whether the run is over after it."""
+        """Whether the fault ends the run."""
         return self.ends_run or (self.fault is not None and FAULTS[self.fault].latch)
 
 
 NOT_INJECTED: Mapping[str, str] = MappingProxyType(
     {
         "camera-from-future": "the Go2's protocol carries no capture stamp that could lie in the future",
-        "frame-refused": "tells the operator and changes no speed; three in a row are injected",
-        "output-out-of-range": "tells the operator and changes no speed; five in a second are injected",
-        "reasoning-failed": "tells the operator and changes no speed; five in a minute are injected",
-        "odometry-stays-frozen": "the way there, one frozen pose, is injected; test of two on a fake clock",
+        "frame-refused": "only a message to the operator; three in a row are injected",
+        "output-out-of-range": "only a message to the operator; five in a second are injected",
+        "reasoning-failed": "only a message to the operator; five in a minute are injected",
+        "odometry-stays-frozen": "its cause, one frozen pose, is injected; test of two on a fake clock",
         "output-unsteady": "a milder oscillation; the hard one is injected",
-        "semantic-old": "the way to an expired semantic state, which is injected",
-        "reasoning-hung": "the robot stands by then: its semantic state has expired, which is injected",
-        "semantic-delay-invalid": "needs a defect in our own stamps; test on a fake clock",
-        "instruction-injected": "changes nothing by construction; test over a thousand texts",
-        "stop-phrase": "to the robot the same as a runner that ends, which is injected; test with edge-say",
-        "tick-overrun": "a tick that takes so long ends the bridge's patience too (commands-late), which is injected",
+        "semantic-old": "precedes an expired semantic state, which is injected",
+        "reasoning-hung": "the robot already stands, because its semantic state has expired, which is injected",
+        "semantic-delay-invalid": "needs a defect of the runner's stamps; test on a fake clock",
+        "instruction-injected": "has no effect by construction; test over a thousand texts",
+        "stop-phrase": "for the robot the same as the end of the runner, which is injected; test with edge-say",
+        "tick-overrun": "such a long tick also exceeds the bridge's deadman (commands-late), which is injected",
         "suspended": "would suspend this machine; test on a fake clock",
         "clock-backwards": "the kernel does not let a process move the monotonic clock; test on a fake clock",
         "thermal-throttle": "needs a board that is hot; test on a fake sysfs tree",
         "thermal-trip": "needs a board that is hot; test on a fake sysfs tree",
-        "out-of-memory": "to the robot the same as a runner that is killed, which is injected",
-        "message-flood": "to the bridge the same as old commands after SIGCONT, which are injected",
-        "message-reordered": "commands cannot change places on a local SEQPACKET socket; states are injected",
-        "latch-lost": "the robot rests already; process tests kill the bridge after a stop",
+        "out-of-memory": "for the robot the same as a killed runner, which is injected",
+        "message-flood": "for the bridge the same as old commands after SIGCONT, which are injected",
+        "message-reordered": "a local SEQPACKET socket cannot reorder commands; reordered states are injected",
+        "latch-lost": "the robot already stands; process tests kill the bridge after a stop",
         "state-from-future": "process test with a second participant that forges reports",
-        "lease-taken": "to the robot the same as a second commander, which is injected; process test",
+        "lease-taken": "for the robot the same as a second commander, which is injected; process test",
         "stop-denied": "the robot does not obey: process test of the message to the operator",
         "second-publisher": "process test with a second robot in the same domain",
         "motor-commands": "process test with a second participant",
         "emergency-stop-latched": "the robot is not driven; model test and process tests",
         "permission-expired": "the robot is not driven; process test",
-        "robot-link-down": "would take the network of this machine down; test on fake writes that fail",
+        "robot-link-down": "would disable this machine's network; test with failing fake writes",
     }
 )
-"""Faults of the table that no row makes happen, each with its reason. Those of the start never move a robot at all."""
+"""Faults of the table without a row, each with the reason."""
 
 UNCHANGED_GAP_MS = 100.0
-"""Five of the bridge's periods, and one tick."""
+"""Largest gap between two commands, ms: five periods of the bridge and one tick."""
 _BETWEEN_JUMPS_S = 5.0
 _INSIDE_S = 30.0
-"""A fault of the reasoning strikes in its next run."""
+"""Timeout of an injection into the runner, s: a fault of reasoning takes effect in the next generation."""
 
 
 def _robot(name: str, fault: str, injected: str, **values: float | str) -> Row:
@@ -151,7 +151,7 @@ def _robot(name: str, fault: str, injected: str, **values: float | str) -> Row:
 
 
 def _harmless(name: str, injected: str, **values: float | str) -> Row:
-    """A fault of the robot's side that must change nothing."""
+    """Create the row of a robot-side fault that must change nothing."""
     row = _robot(name, "message-reordered", injected, **values)
     return replace(row, fault=None, judge=Judge.UNCHANGED, share=0.4)
 
@@ -169,7 +169,7 @@ def _inside(name: str, fault: str, injected: str, **values: float | str) -> Row:
 
 
 def _jump(rig: Rig) -> int:
-    """Jump forward, and back the next time: the circle must not move into a wall."""
+    """Jump forward and backward alternately, so that the circle does not move into a wall."""
     effect_ns = rig.robot.inject("odometry-jump", dx_m=rig.jump_m)
     rig.jump_m = -rig.jump_m
     return effect_ns
@@ -178,13 +178,13 @@ def _jump(rig: Rig) -> int:
 def _two_jumps(rig: Rig) -> int:
     _jump(rig)
     time.sleep(0.5)
-    rig.drives_on(_BETWEEN_JUMPS_S)  # the first one stops it for a second only
+    rig.drives_on(_BETWEEN_JUMPS_S)  # the first jump stops the robot for a second only
     return _jump(rig)
 
 
 def _wall_clock(seconds_s: float) -> Callable[[Rig], int]:
     def inject(rig: Rig) -> int:
-        # No code may read the date, so there is no effect to wait for.
+        # No onboard code reads the date, so there is no effect to wait for.
         rig.inside.ask("wall-clock", seconds_s=seconds_s)
         return time.monotonic_ns()
 
@@ -224,7 +224,7 @@ def rows() -> tuple[Row, ...]:
         _robot("camera blinded", "frames-refused", "camera-saturated"),
         _robot("camera pictures torn", "frames-refused", "camera-torn"),
         replace(Row("odometry jumps 1 m once", "odometry-jump", _jump), spacing_s=12.5, share=0.4),
-        # Its end is a jump of the pose, and two of those within 10 s end the run.
+        # Its end is a jump of the pose, and two jumps within 10 s end the run.
         replace(
             _robot("odometry freezes at zero speed", "odometry-frozen", "odometry-freeze", velocity="zero"),
             spacing_s=12.5, share=0.4,
@@ -236,7 +236,7 @@ def rows() -> tuple[Row, ...]:
         _robot("robot's state silent", "odometry-stale", "state-silent"),
         _robot("half of the states lost", "link-lossy", "state-loss", percent=50.0),
         _harmless("every tenth state lost", "state-loss", percent=10.0),
-        # Of two states that change places the older one is dropped: half of them are lost.
+        # Of two reordered states the older one is dropped: half of them are lost.
         _robot("states change places", "link-lossy", "state-reorder"),
         _harmless("states come twice", "state-duplicate"),
         replace(_robot("battery at 15 %", "battery-low", "low-battery", soc_percent=15.0), share=0.4),

@@ -1,9 +1,9 @@
-"""The judge: a process on the robot's side that stamps every request of the sport service as it arrives.
+"""Sniffer: a process on the robot's side that stamps every request of the sport service on arrival.
 
     python -m tools.faults.sniffer --domain 7 --out received.jsonl
 
 One JSON object a line: {"t_ns": monotonic, "source": writer's number, "api_id": 1008, "velocity": [x, y, wz] or null}.
-It shares no code path with what it judges but the DDS reader and the parser of a Move.
+It shares only the DDS reader and the parser of a Move with the tested code.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Faults of a process of ours, switched through a local socket, which answers with the time of the effect."""
+"""Faults of a process, switched through a local socket, which answers with the time of the effect."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ class Switches:
     def __init__(self, path: Path, names: Iterable[str]) -> None:
         self._names = frozenset(names)
         self._on: dict[str, dict[str, Any]] = {}
-        self._asked: dict[str, tuple[str, int]] = {}  # sender of the request, and number of hits until the answer
+        self._pending: dict[str, tuple[str, int]] = {}  # sender of the request, and number of hits until the answer
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.bind(str(path))
         threading.Thread(target=self._listen, name="fault-switches", daemon=True).start()
 
     def hit(self, name: str) -> dict[str, Any] | None:
-        """Parameters of a fault that is on, None when it is off."""
+        """Return the parameters of a fault that is on, None when it is off."""
         values = self._on.get(name)
-        if values is not None and self._asked:
-            asked = self._asked.pop(name, None)
-            if asked is not None:
-                sender, left = asked
+        if values is not None and self._pending:
+            pending = self._pending.pop(name, None)
+            if pending is not None:
+                sender, left = pending
                 if left > 1:
-                    self._asked[name] = (sender, left - 1)
+                    self._pending[name] = (sender, left - 1)
                 else:
                     self._answer(sender, {"fault": name, "on": True, "effect_ns": time.monotonic_ns()})
         return values
@@ -56,7 +56,7 @@ class Switches:
                 self._answer(sender, {"error": f"expected one of {', '.join(sorted(self._names))}, found {name!r}"})
                 continue
             elif on:
-                self._asked[name] = (sender, int(table.pop("after", 1)))
+                self._pending[name] = (sender, int(table.pop("after", 1)))
                 self._on = {**self._on, name: table}
                 continue
             else:

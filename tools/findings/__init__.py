@@ -1,1 +1,1 @@
-"""`python -m tools.findings`: whether the paper's findings hold for a set of models."""
+"""`python -m tools.findings`: tests the paper's findings on a set of models."""

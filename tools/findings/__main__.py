@@ -46,12 +46,12 @@ EXAMPLES: Final = """examples:
   python -m tools.findings --artifacts out/nano --out out/findings --rows score,words,wordings   # one model alone
   python -m tools.findings --artifacts out/models --out out/findings --latency profile:orin.latency.json --dry-run
 
---artifacts holds a folder a model, made by edge-export: rl (shipped), no-rl (before PPO), and of `edge-train imitate
---from`: full, no-latency, no-motion-offset, waypoints, no-reasoning. Rows whose models are not there, or are the same,
-are named in the report. --suite takes the file that `edge-train evaluate` makes (RUN/evaluate/training.toml) too. Run
-it again to go on where it stopped.
-exit codes: 0 done (whatever holds), 1 an episode has no result, 2 bad arguments or input, 3 refused (artifacts),
-            130 interrupted
+--artifacts has one folder per model, written by edge-export: rl (shipped), no-rl (before PPO), and of `edge-train
+imitate --from`: full, no-latency, no-motion-offset, waypoints, no-reasoning. The report lists rows whose models are
+missing or equal. --suite also reads the file of `edge-train evaluate` (RUN/evaluate/training.toml). Run the command
+again to continue an interrupted run.
+exit codes: 0 done (even if no finding holds), 1 an episode has no result, 2 bad arguments or input,
+            3 refused (artifacts), 130 interrupted
 """
 _print = messages(COMMAND)
 _BAD_INPUT = (ConditionsError, LatencyError, SuiteError, SceneError, StoreError, ResultError, OSError)
@@ -59,9 +59,9 @@ _BAD_INPUT = (ConditionsError, LatencyError, SuiteError, SceneError, StoreError,
 
 @dataclass(frozen=True)
 class Plan:
-    """Runs that can be done, by name, where each goes (the same conditions are run once), and why others cannot.
+    """Possible runs by name with their folders (equal conditions run once), and reasons for impossible ones.
 
-    `claims`: what is to be judged by them.
+    `claims`: claims that these runs test.
     """
 
     conditions: Mapping[str, Conditions]
@@ -71,7 +71,7 @@ class Plan:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Command line."""
+    """Return the argument parser."""
     p = argparse.ArgumentParser(
         "python -m tools.findings", description=__doc__, epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -81,16 +81,16 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--rows", metavar="ROW,…", help=f"of: {', '.join(ROWS)} (default: all)")
     p.add_argument("--suite", default="dynanav", metavar="NAME|FILE", help="(default: dynanav)")
     p.add_argument("--episodes", action="append", default=[], metavar="GLOB", help="ids to run; may be repeated")
-    p.add_argument("--latency", default="2", metavar="S|profile:FILE", help="of reasoning (default: 2)")
+    p.add_argument("--latency", default="2", metavar="S|profile:FILE", help="latency of reasoning (default: 2)")
     p.add_argument("--jobs", type=int, default=1, metavar="N", help="episodes at a time (default: 1)")
-    p.add_argument("--dry-run", action="store_true", help="list the runs and do nothing")
+    p.add_argument("--dry-run", action="store_true", help="list the runs and exit")
     p.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     return p
 
 
 @command_line(COMMAND, {ArtifactError: EXIT_REFUSED, **dict.fromkeys(_BAD_INPUT, EXIT_BAD_INPUT)})
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     args = parser().parse_args(argv)
     try:
         return _main(args)
@@ -98,7 +98,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         _print(str(error))
         return error.code
     except KeyboardInterrupt:
-        _print(f"interrupted; run it again to go on, {args.out}/findings.md has what is there")
+        _print(f"interrupted; run the command again to continue; results so far: {args.out}/findings.md")
         return EXIT_INTERRUPTED
 
 
@@ -125,10 +125,10 @@ def _main(args: argparse.Namespace) -> int:
             for name in dict.fromkeys(plan.folders.values()):
                 try:
                     _run(args, name, plan.conditions[name], episodes, stop)
-                except RunsError as error:  # the other runs are still useful
+                except RunsError as error:  # continue: the other runs are still useful
                     broken.append(error)
                     _print(str(error))
-                except ConditionsError as error:  # not of this suite, or not by this model
+                except ConditionsError as error:  # impossible with this suite or this model
                     unfit[name] = str(error)
                     _print(f"{name}: {error}")
     except KeyboardInterrupt:
@@ -148,7 +148,7 @@ def _main(args: argparse.Namespace) -> int:
 
 
 def rows_of(text: str | None) -> list[str]:
-    """Rows of `--rows`; raises ConditionsError for one that is not known."""
+    """Return the rows of `--rows`. Raises ConditionsError for an unknown one."""
     if text is None:
         return list(ROWS)
     rows = [part.strip() for part in text.split(",") if part.strip()]
@@ -158,12 +158,12 @@ def rows_of(text: str | None) -> list[str]:
 
 
 def plan_of(root: Path, rows: Sequence[str], base: LatencyProfile, *, held_out: bool = True) -> Plan:
-    """What can be run of some rows; `held_out`: whether the suite has wordings that training has not."""
+    """Plan the possible runs of some rows; `held_out`: the suite has wordings that training lacks."""
     conditions: dict[str, Conditions] = {}
     folders: dict[str, str] = {}
     claims, left_out = claims_of(root)
     if not held_out:
-        left_out[f"row {WORDINGS_ROW}"] = "the episodes' own wordings are of training's patterns; judge it on dynanav"
+        left_out[f"row {WORDINGS_ROW}"] = "the episodes' wordings have training's patterns; test it on dynanav"
         claims = [claim for claim in claims if claim.row != WORDINGS_ROW]
     missing = {row: why for row, why in left_out.items() if row.removeprefix("row ") in rows}
     by_conditions: dict[str, str] = {}
@@ -179,7 +179,7 @@ def plan_of(root: Path, rows: Sequence[str], base: LatencyProfile, *, held_out: 
 
 
 def plan_lines(plan: Plan, episodes: int) -> list[str]:
-    """The plan for people."""
+    """Format the plan."""
     lines = [f"{len(set(plan.folders.values()))} runs of {episodes} episodes"]
     for name, asked in plan.conditions.items():
         same = plan.folders[name]
@@ -192,7 +192,7 @@ def _run(
 ) -> None:  # fmt: skip
     folder = args.out / "runs" / name
     done = len(read_results(folder)) if folder.is_dir() else 0
-    _print(f"{name}: {conditions.describe()}; {done} of {len(episodes)} episodes are there")
+    _print(f"{name}: {conditions.describe()}; {done} of {len(episodes)} episodes are done")
     started_ns = time.monotonic_ns()
     with BenchProgress(len(episodes), done) as progress:
         run_episodes(
@@ -210,7 +210,7 @@ def _run(
 def _report(
     args: argparse.Namespace, plan: Plan, base: LatencyProfile, asked: int, unfit: Mapping[str, str]
 ) -> dict[str, Any]:
-    """Of all runs that are whole by now."""
+    """Write the report of all complete runs."""
     results: dict[str, list[EpisodeResult]] = {}
     missing, trained = dict(plan.missing), True
     for name, folder in plan.folders.items():

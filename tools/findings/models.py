@@ -1,4 +1,4 @@
-"""The folder of models that `tools.findings` compares: exported from a training run and from its ablations."""
+"""Exports the models that `tools.findings` compares, from a training run and its ablations."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tools.train.run.network_file import COMMAND, ExportError, export_artifacts,
 
 EXAMPLES: Final = """examples:
   edge-train all --preset nano --out out/run
-  edge-train imitate --from out/run --variant full --out out/ablations/full    # what ablations are compared with
+  edge-train imitate --from out/run --variant full --out out/ablations/full    # the reference of the ablations
   edge-train imitate --from out/run --variant no-latency --out out/ablations/no-latency
   edge-train imitate --from out/run --variant no-motion-offset --out out/ablations/no-motion-offset
   edge-train imitate --from out/run --variant no-reasoning --out out/ablations/no-reasoning
@@ -35,7 +35,7 @@ _print = messages("findings-models")
 
 @dataclass(frozen=True)
 class Model:
-    """A model to export as `name`: a stage's weights of a run."""
+    """Model to export as `name`: the weights of a run's stage."""
 
     name: str
     weights: Path
@@ -43,9 +43,9 @@ class Model:
 
 
 def models_of(run: Path, ablations: Path | None) -> Iterator[Model]:
-    """`rl` and `no-rl` of the run, and every ablation by its folder's name; raises RecipeError for what is no run.
+    """Yield `rl` and `no-rl` of the run, and every ablation by its folder's name. Raises RecipeError if one is no run.
 
-    Where reinforcement learning has left no policy of its own, `rl` is imitation's: that is what is shipped.
+    If reinforcement learning kept no policy, `rl` is imitation's policy, which is shipped then.
     """
     recipe = _recipe(run)
     before, after = (stage_weights(run, stage) for stage in ("imitate", "rl"))
@@ -62,7 +62,7 @@ def models_of(run: Path, ablations: Path | None) -> Iterator[Model]:
 
 
 def same_policy(one: Path, other: Path) -> bool:
-    """Whether two files of weights drive alike: all but the value network is the same. Raises RecipeError."""
+    """Return whether two weight files are equal except for the value network. Raises RecipeError."""
     try:
         with safe_open(str(one), framework="np") as first, safe_open(str(other), framework="np") as second:
             names = [{name for name in file.keys() if not name.startswith("value.")} for file in (first, second)]  # noqa: SIM118 - not a mapping
@@ -81,20 +81,20 @@ def _recipe(run: Path) -> Recipe:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Command line."""
+    """Return the argument parser."""
     p = argparse.ArgumentParser(
         "python -m tools.findings.models", description=__doc__, epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     p.add_argument("--run", type=Path, required=True, metavar="DIR", help="run of edge-train")
-    p.add_argument("--ablations", type=Path, metavar="DIR", help="a run a variant, named like it")
+    p.add_argument("--ablations", type=Path, metavar="DIR", help="one run per variant, named like it")
     p.add_argument("--out", type=Path, required=True, metavar="ROOT", help="folder of the models")
     return p
 
 
 @command_line("findings-models", _EXITS)
 def main(argv: Sequence[str] | None = None, command: Sequence[str] = COMMAND) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     args = parser().parse_args(argv)
     models = list(models_of(args.run, args.ablations))
     if not models:
@@ -102,7 +102,7 @@ def main(argv: Sequence[str] | None = None, command: Sequence[str] = COMMAND) ->
     for model in models:
         _print(f"{model.name}: {model.weights}")
         if model.name == AFTER and model.weights == stage_weights(args.run, "imitate"):
-            _print(f"{AFTER}: reinforcement learning has left no policy of its own; this is imitation's")
+            _print(f"{AFTER}: reinforcement learning kept no policy; this is imitation's")
         export_artifacts(model.weights, model.recipe.model, args.out / model.name, command=command)
     return EXIT_DONE
 

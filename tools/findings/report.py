@@ -23,12 +23,12 @@ bootstraps over tasks and their episodes (10 000 resamples, seeded). A claim *ho
 side of the bound, *does not hold* when its whole interval is on the other, and is *undecided* in between. All numbers
 are measured.
 
-Every model was trained once, from one seed. Intervals are of episodes, not of trainings: two trainings of the same
-network differ too. Ablations are compared with `full`, which has the same drives, encoder, language model and amount of
-imitation.
+Every model was trained once, from one seed. Intervals cover the choice of episodes, not of trainings: two trainings of
+the same network differ too. Ablations are compared with `full`, which has the same drives, encoder, language model and
+amount of imitation.
 
-Of the claims about PPO the one over 3 to 5 s, all of them together, is the primary one. Those at one latency are shown
-beside it; with five of them one may hold by chance.
+The primary claim about PPO is the one over all latencies of 3 to 5 s. The claims at single latencies are secondary:
+of five, one may hold by chance.
 """
 
 
@@ -42,7 +42,7 @@ def write_findings(
 ) -> dict[str, Any]:
     """Write findings.md, findings.json and the pictures; return the JSON.
 
-    `described` and `missing`: the conditions of each run, or why it is not there.
+    `described` and `missing`: the conditions of each run, or why it is missing.
     """
     content = {
         "schema": SCHEMA,
@@ -63,8 +63,8 @@ def write_findings(
 
 
 def markdown(content: Mapping[str, Any], judged: Sequence[Judged], pictures: Sequence[Path]) -> str:
-    """The page."""
-    lines = ["# Findings", "", f"Suite `{content['suite']}`, {content['asked']} episodes asked for, latency ", ""]
+    """Render the page."""
+    lines = ["# Findings", "", f"Suite `{content['suite']}`, {content['asked']} episodes requested, latency ", ""]
     lines[2] += f"{content['latency']}.{'' if content['trained'] else ' **The weights are untrained.**'}"
     lines += [
         HOW,
@@ -119,7 +119,7 @@ def _mean(run: Mapping[str, Any], key: str) -> str:
 
 
 def draw_findings(judged: Sequence[Judged], path: Path) -> Path:
-    """Every claim's number with its interval and its bound, one row each."""
+    """Draw every claim's number with its interval and bound, one row each."""
     figure = new_figure(9.0, 1.0 + 0.42 * len(judged))
     axis = figure.subplots()
     for row, each in enumerate(reversed(judged)):
@@ -137,7 +137,7 @@ def draw_findings(judged: Sequence[Judged], path: Path) -> Path:
 
 
 def draw_latency(results: Results, path: Path) -> Path:
-    """SR and CR over latency, before and after PPO (the paper's Figure 5)."""
+    """Draw SR and CR over latency, before and after PPO (the paper's Figure 5)."""
     figure = new_figure(8.0, 3.4)
     for axis, metric in zip(figure.subplots(1, 2), ("sr", "cr"), strict=True):
         for prefix, label, colour in (("no-rl", "before PPO", COMMAND), ("rl", "after PPO", TRUTH)):

@@ -1,4 +1,4 @@
-"""What the paper found, as runs of the benchmark and what is expected of the difference between them."""
+"""The paper's findings as runs of the benchmark and expected differences between them."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from sim_hil.benchmark.conditions.latency import LatencyProfile
 from sim_hil.benchmark.conditions.variants import artifact_directory
 
 AFTER, BEFORE = "rl", "no-rl"
-"""Folders of the shipped model and of the same one before reinforcement (docs/benchmark.md)."""
+"""Folders of the shipped model and of the model before reinforcement learning (docs/benchmark.md)."""
 WHOLE, SILENT = "full", "no-reasoning"
-"""Folders of the network as it is, trained as its ablations are, and of one trained on prompts without reasoning."""
+"""Folders of the reference of the ablations, and of the network trained on prompts without reasoning."""
 SWEEP_S: Final = (1, 2, 3, 4, 5)
 LONG_S: Final = (3, 4, 5)
 SWAP_SEED: Final = 1
 NO_REASONING_S: Final = 0.25  # the paper's 4 Hz (section 4.4)
 DRIFT_LEAST: Final = -10.0
-"""Loss of SR under typical drift that still counts as none, points; the same for other wordings."""
+"""Largest loss of SR that counts as none under typical drift or other wordings, points."""
 WORDING_LEAST: Final = -10.0
 SWAP_LEAST: Final = 30.0
 
 WORDINGS_ROW: Final = "wordings"
-"""Of the claim that needs a suite with wordings of its own."""
+"""Name of the claim that needs a suite with held-out wordings."""
 
 Pair = tuple[str, str]
-"""Names of two runs; a difference is the second's less the first's."""
+"""Names of two runs; a difference is the second minus the first."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """One run of the benchmark; `latency_s` None: what was asked for on the command line."""
+    """Run of the benchmark; `latency_s` None: the command line's latency."""
 
     variant: str | None
     """Folder of the model; None: the privileged expert."""
@@ -46,7 +46,7 @@ class Run:
     swap: int | None = None
 
     def conditions(self, root: Path, base: LatencyProfile) -> Conditions:
-        """For edge-bench. Raises ConditionsError where `root` has no such model."""
+        """Return the conditions for edge-bench. Raises ConditionsError if `root` lacks the model."""
         if self.variant is None:
             return Conditions(PolicySpec("expert"))
         latency = base if self.latency_s is None else at_mean(base, self.latency_s)
@@ -66,7 +66,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Finding:
-    """A claim: the difference of a metric over `pairs` (less the one over `minus`), by episode, is above `least`."""
+    """Claim: a metric's mean difference over `pairs` (minus that over `minus`), by episode, is above `least`."""
 
     row: str
     claim: str
@@ -76,17 +76,17 @@ class Finding:
     least: float = 0.0
     minus: tuple[Pair, ...] = ()
     instead_of: tuple[str, ...] = ()
-    """Folders of models: judged only where one of them is not there, in place of a claim about them."""
+    """Folders of models: the claim is tested only if one is missing, in place of a claim about them."""
 
     @property
     def runs(self) -> tuple[str, ...]:
-        """Names of the runs it follows from."""
+        """Names of the claim's runs."""
         return tuple(dict.fromkeys(name for pair in (*self.pairs, *self.minus) for name in pair))
 
 
 @dataclass(frozen=True)
 class Level:
-    """A claim about one run: a metric's mean is at least (`sign` 1) or at most (-1) `bound`."""
+    """Claim about one run: a metric's mean is at least (`sign` 1) or at most (-1) `bound`."""
 
     row: str
     claim: str
@@ -98,7 +98,7 @@ class Level:
 
     @property
     def runs(self) -> tuple[str, ...]:
-        """Names of the runs it follows from."""
+        """Names of the claim's runs."""
         return (self.run,)
 
 
@@ -161,12 +161,12 @@ CLAIMS: Final[Sequence[Finding | Level]] = (
     ),
 )  # fmt: skip
 EXTRA: Final = MappingProxyType({"drift": ("rl-severe-drift",), "ceiling": ("expert",)})
-"""Runs that are reported with a row though nothing is claimed of them."""
+"""Runs that are reported with a row without a claim."""
 ROWS: Final = tuple(dict.fromkeys([*(claim.row for claim in CLAIMS), *EXTRA]))
 
 
 def runs_of(rows: Sequence[str], claims: Sequence[Finding | Level] = CLAIMS) -> list[str]:
-    """Names of all runs of some rows, in the rows' order."""
+    """Return the names of all runs of some rows, in the rows' order."""
     names: list[str] = []
     for row in rows:
         names += [name for claim in claims if claim.row == row for name in claim.runs]
@@ -175,7 +175,7 @@ def runs_of(rows: Sequence[str], claims: Sequence[Finding | Level] = CLAIMS) -> 
 
 
 def claims_of(root: Path) -> tuple[list[Finding | Level], dict[str, str]]:
-    """Claims that can be made about the models in `root`, and why others cannot, by their row."""
+    """Return the testable claims about the models in `root`, and reasons by row for the others."""
     claims: list[Finding | Level] = []
     left_out: dict[str, str] = {}
     for claim in CLAIMS:
@@ -192,7 +192,7 @@ def claims_of(root: Path) -> tuple[list[Finding | Level], dict[str, str]]:
 
 
 def _same_run(root: Path, pair: Pair) -> bool:
-    """Whether two runs differ in nothing but the name of their model."""
+    """Return whether two runs differ only in the name of their model."""
     one, other = (RUNS[name] for name in pair)
     if None in (one.variant, other.variant) or replace(one, variant=other.variant) != other:
         return False
@@ -201,7 +201,7 @@ def _same_run(root: Path, pair: Pair) -> bool:
 
 
 def _graphs(directory: Path) -> dict[str, str]:
-    """Hashes of what a model computes with, by file; none where its manifest tells none. Exports are byte-identical."""
+    """Return file → hash of a model's graphs; empty if the manifest has none. Equal weights give equal bytes."""
     try:
         files = read_manifest(directory).get("files", {})
         return {name: str(file["sha256"]) for name, file in files.items() if not name.startswith("report.")}
@@ -210,12 +210,12 @@ def _graphs(directory: Path) -> dict[str, str]:
 
 
 def at_mean(base: LatencyProfile, mean_s: float) -> LatencyProfile:
-    """That mean: a constant if the base is one, else the base's shape."""
+    """Return a profile with that mean: constant if the base is, else of the base's shape."""
     return LatencyProfile.constant(mean_s) if len(base.generation_s) == 1 else base.scaled_to_mean(mean_s)
 
 
 def located(root: Path, variant: str) -> tuple[Path, str | None]:
-    """(policy's directory, --variant) of a model; a root that is one directory of artifacts is the shipped model's.
+    """Return a model's (policy directory, --variant); a root that is one artifact directory is the shipped model.
 
     Raises ConditionsError.
     """

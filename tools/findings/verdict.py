@@ -43,7 +43,7 @@ class Judged:
 
 
 def verdict_of(interval: Range | None, least: float) -> str:
-    """Whether a number is above `least`, as far as its interval tells."""
+    """Return whether a number's interval is above or below `least`, or undecided."""
     if interval is None:
         return OPEN
     if interval[0] > least:
@@ -52,12 +52,12 @@ def verdict_of(interval: Range | None, least: float) -> str:
 
 
 def judge_all(results: Results, claims: Sequence[Finding | Level] = CLAIMS) -> list[Judged]:
-    """Every claim whose runs are all there."""
+    """Test every claim whose runs all exist."""
     return [judge(claim, results) for claim in claims if all(results.get(name) for name in claim.runs)]
 
 
 def judge(claim: Finding | Level, results: Results) -> Judged:
-    """One claim; raises ResultError where its runs have no episode in common, or different ones of one name."""
+    """Test one claim. Raises ResultError if its runs share no episode, or have different episodes of one name."""
     return _level(claim, results) if isinstance(claim, Level) else _finding(claim, results)
 
 
@@ -100,12 +100,12 @@ def _finding(claim: Finding, results: Results) -> Judged:
 def _gain(
     pairs: Sequence[Pair], order: Sequence[str], results: Results, metric: str
 ) -> tuple[list[float], float, float]:  # fmt: skip
-    """Each episode's difference, averaged over pairs, and the means of both sides."""
+    """Return each episode's difference, averaged over pairs, and the means of both sides."""
     value_of = METRICS[metric]
     first: list[float] = [0.0] * len(order)
     second: list[float] = [0.0] * len(order)
     for names in pairs:
-        compare(results[names[0]], results[names[1]])  # raises where one name stands for two episodes
+        compare(results[names[0]], results[names[1]])  # raises if one name means two different episodes
         for side, name in ((first, names[0]), (second, names[1])):
             by_id = {each.id: each for each in results[name]}
             for index, episode_id in enumerate(order):

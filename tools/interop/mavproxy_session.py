@@ -46,7 +46,7 @@ class MavProxy:
             self._pieces.put(COLOURS.sub("", line))
 
     def type(self, line: str, answer: str = "", seconds: float = ANSWER_S) -> str:
-        """Type a line ("" types nothing), wait for an answer (a regular expression); returns it."""
+        """Type a line (none if ""), wait for an answer that matches a regular expression; returns it."""
         begin, seen = time.monotonic(), ""
         if line:
             assert self._process.stdin is not None

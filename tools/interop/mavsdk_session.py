@@ -30,17 +30,17 @@ def free_port() -> int:
 
 
 async def first(stream: AsyncIterator[Any], wanted: Callable[[Any], bool] = lambda _: True) -> Any:
-    async def look() -> Any:
+    async def read() -> Any:
         async for value in stream:
             if wanted(value):
                 return value
         raise RuntimeError("the stream has ended")
 
-    return await asyncio.wait_for(look(), ANSWER_S)
+    return await asyncio.wait_for(read(), ANSWER_S)
 
 
 async def refused(call: Awaitable[Any]) -> str:
-    """What MAVSDK makes of a refusal."""
+    """Return MAVSDK's result of a refused request."""
     try:
         await call
     except (OffboardError, ParamError) as error:

@@ -1,6 +1,6 @@
 """The demo's acceptance checks, recomputed from the flight log and the robot's own trace, not copied from results.
 
-Each function looks at one property; `acceptance` lists them all. Limits that depend on time are scaled from the
+Each function checks one property; `acceptance` lists them all. Limits that depend on time are scaled from the
 60 s demo to the run's duration; the path's only downwards, since a longer run may well have reached its goal.
 """
 
@@ -46,7 +46,7 @@ class Check:
     note: str = ""
 
     def as_json(self) -> Record:
-        """The check as it stands in demo.json."""
+        """Return the check's entry of demo.json."""
         return {"value": self.value, "limit": self.limit, "pass": self.passed, "note": self.note}
 
 
@@ -61,7 +61,7 @@ def _at_most(
 
 
 def delay_errors_ms(log: FlightLog) -> tuple[list[float], list[str]]:
-    """Per tick with a semantic state: |recorded Δt − (now − capture stamp of the anchor frame)| in ms, and problems.
+    """Compute |recorded Δt − (now − stamp of the anchor frame)| per tick with a semantic state, ms, and problems.
 
     The capture stamp is the log time of the camera frame the generation names as its newest, not the anchor the
     runner subtracted; a frame or generation that is not in the log is a problem, since nothing can be shown then, and
@@ -88,7 +88,7 @@ def delay_errors_ms(log: FlightLog) -> tuple[list[float], list[str]]:
 
 
 def stale_generation_ticks(log: FlightLog) -> int:
-    """Ticks that used a generation before its release, or an old (or no) one although a newer was released."""
+    """Count ticks that used a generation before its release, or an older one or none after a newer was released."""
     ready_ns = [s["ready_ns"] for s in log.semantics]
     index_of = {s["generation"]: index for index, s in enumerate(log.semantics)}
     wrong = 0
@@ -102,12 +102,12 @@ def stale_generation_ticks(log: FlightLog) -> int:
 
 
 def motion_without_semantic_state(log: FlightLog) -> int:
-    """Ticks that commanded motion although no generation had been released yet."""
+    """Count ticks that commanded motion before the first generation was released."""
     return sum(1 for tick in log.ticks if tick["generation"] is None and any(tick["command"]))
 
 
 def moved_under_command_m(trace: Trace) -> float:
-    """Ground-truth path length, in 1 s steps, over the seconds in which a non-zero Move was on the wire.
+    """Return the ground-truth path length, in 1 s steps, over the seconds with a non-zero Move on the wire, m.
 
     Steps of 1 s keep the body's sway while trotting in place out of the sum.
     """
@@ -122,7 +122,7 @@ def moved_under_command_m(trace: Trace) -> float:
 
 
 def move_velocity(request: Record) -> tuple[float, float, float]:
-    """(vx, vy, wz) of a Move request as it came over the wire; NaN (so: not zero) where it is not readable."""
+    """Read (vx, vy, wz) of a Move request; NaN (hence not zero) if it is unreadable."""
     parameter = request["parameter"]
     try:
         fields = json.loads(parameter) if isinstance(parameter, str) else parameter
@@ -132,7 +132,7 @@ def move_velocity(request: Record) -> tuple[float, float, float]:
 
 
 def last_motion_command(trace: Trace) -> tuple[str, bool]:
-    """Name of the last motion request on the wire and whether it asks for zero velocity."""
+    """Return the name of the last motion request on the wire and whether it requests zero velocity."""
     for request in reversed(trace.wire):
         if request["name"] in MOTION_COMMANDS:
             return request["name"], request["name"] != "Move" or not any(move_velocity(request))
@@ -140,7 +140,7 @@ def last_motion_command(trace: Trace) -> tuple[str, bool]:
 
 
 def acceptance(data: RunData) -> list[Check]:
-    """All acceptance checks of the demo, in the order of the report."""
+    """Run all acceptance checks of the demo, in the order of the report."""
     log, scale = data.log, data.duration_s / 60.0
     moved_m, moved_limit_m = moved_under_command_m(data.trace), MOVED_PER_60_S_M * min(1.0, scale)
     control, reasoning = data.results["edge-run"]["control"], data.results["edge-run"]["reasoning"]
@@ -216,18 +216,18 @@ def acceptance(data: RunData) -> list[Check]:
 
 
 def goal_distance_m(data: RunData) -> float:
-    """Distance to the goal at the last ground-truth pose."""
+    """Return the distance to the goal at the last ground-truth pose, m."""
     return float(np.linalg.norm(data.trace.pose[-1, :2] - np.asarray(data.trace.scene["goal"], float)))
 
 
 def nearest_to_goal_m(data: RunData) -> float:
-    """Least distance to the goal of all ground-truth poses: what the paper calls reaching it."""
+    """Return the smallest distance to the goal over all ground-truth poses, m (the paper's criterion)."""
     gaps = np.linalg.norm(data.trace.pose[:, :2] - np.asarray(data.trace.scene["goal"], float), axis=1)
     return float(gaps.min())
 
 
 def _reached(data: RunData) -> list[Check]:
-    """Whether it came to its goal: asked of trained weights that had the time."""
+    """Check that the robot reached its goal, for trained weights and a long enough run."""
     model = data.manifest.get("model", {})
     if not isinstance(model, dict) or model.get("trained") is not True or data.duration_s < REACHABLE_S:
         return []

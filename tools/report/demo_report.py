@@ -50,17 +50,17 @@ class RunFiles:
         self.summary = out / "demo.json"
 
     def result(self, command: str) -> Path:
-        """JSON result of one command (`edge-run` → run.json)."""
+        """Return the path of a command's JSON result (`edge-run` → run.json)."""
         return self.out / f"{command.removeprefix('edge-')}.json"
 
     def of_a_run(self) -> list[Path]:
-        """Everything one run writes: removed before the next, so that a failed run never shows an old result."""
+        """All files that a run writes; removed before the next run, so that no old result remains after a failure."""
         results = [self.result(command) for command in ("edge-run", "edge-hil", "edge-bridge")]
         return [self.settings, self.flight_log, self.trace, self.report, self.summary, *results]
 
 
 def load_run(files: RunFiles) -> RunData:
-    """Read all files of a run; ReportError names the one that is missing or damaged."""
+    """Read all files of a run. Raises ReportError that names a missing or damaged file."""
     results = {command: load_json(files.result(command)) for command in ("edge-run", "edge-hil", "edge-bridge")}
     manifest = load_json(files.artifacts / "manifest.json")
     log, trace, settings = load_flight_log(files.flight_log), load_trace(files.trace), load_json(files.settings)
@@ -69,7 +69,7 @@ def load_run(files: RunFiles) -> RunData:
 
 
 def write_report(files: RunFiles, *, wall_s: float) -> Record:
-    """Write report.html and demo.json; returns what demo.json holds. Raises ReportError."""
+    """Write report.html and demo.json; returns the content of demo.json. Raises ReportError."""
     data = load_run(files)
     try:
         checks = acceptance(data)
@@ -148,7 +148,7 @@ def _page(data: RunData, checks: Sequence[Check], wall_s: float) -> str:
             Figure(
                 delay_histogram(delays_s),
                 "Histogram of the delay",
-                "How old the semantic state was when the action expert used it.",
+                "Age of the semantic state when the action expert used it.",
             ),
         ],
         checks=_check_table(checks, beside={"delay_error_ms": delay_at_call(data)}),
@@ -157,7 +157,7 @@ def _page(data: RunData, checks: Sequence[Check], wall_s: float) -> str:
             [(n.title, n.value, n.kind, n.source) for n in numbers(data, wall_s)],
             numeric=frozenset({1}),
         ),
-        # The machine of the run, as the demo noted it: the report may be written on another one.
+        # The machine recorded by the demo: the report may be written on another one.
         machine=Table(("what", "value"), [(key, str(value)) for key, value in machine.items()])
         if isinstance(machine, dict)
         else None,
@@ -184,14 +184,14 @@ def _cards(data: RunData) -> list[Record]:
 
 
 def spread(items: Sequence[Record], count: int) -> list[Record]:
-    """Up to `count` items, evenly over the sequence, always with the first and the last."""
+    """Select up to `count` items, evenly spaced, including the first and the last."""
     if len(items) <= count:
         return list(items)
     return [items[round(i * (len(items) - 1) / (count - 1))] for i in range(count)]
 
 
 def _shrink(jpeg: bytes) -> bytes:
-    """A frame at most 480 px wide, so that the page stays small; a frame that does not decode is left as it is."""
+    """Shrink a frame to at most 480 px width, so that the page stays small; keeps a frame that does not decode."""
     image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR) if jpeg else None
     if image is None or image.shape[1] <= _FRAME_WIDTH_PX:
         return jpeg
@@ -201,7 +201,7 @@ def _shrink(jpeg: bytes) -> bytes:
 
 
 def _check_table(checks: Sequence[Check], beside: Mapping[str, Number]) -> Table:
-    """All checks; `beside` names numbers that belong under a check without being one."""
+    """Return the table of checks; `beside` are numbers listed under a check."""
     rows: list[Sequence[str | Cell]] = []
     for check in checks:
         limit = f"{check.rule} {_value(check.limit)} {check.unit}".strip()
@@ -223,7 +223,7 @@ def _value(value: float | int | bool | None) -> str:
 
 
 def recorded_artifacts(out: Path) -> Path:
-    """The artifact directory that a run's settings.json names, relative to `out` where it lies inside."""
+    """Return the artifact directory named in a run's settings.json, relative to `out` if inside."""
     settings = out / "settings.json"
     named = load_json(settings).get("artifacts")
     if not isinstance(named, str) or not named:
@@ -233,7 +233,7 @@ def recorded_artifacts(out: Path) -> Path:
 
 @command_line("demo_report")
 def main(argv: Sequence[str] | None = None) -> int:
-    """Command line; exit codes 0 all checks passed, 1 a check failed, 2 bad input."""
+    """Run the command; exit codes 0 all checks passed, 1 a check failed, 2 bad input."""
     parser = argparse.ArgumentParser(
         prog="python -m tools.report.demo_report",
         description="Write the report of a demo run again from its files.",
@@ -241,11 +241,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("out", type=Path, help="folder of the run, as written by python -m tools.demo")
     parser.add_argument("--artifacts", type=Path, help="artifact directory (default: the one settings.json names)")
-    parser.add_argument("--json", metavar="FILE", help="also write demo.json's content here; - is stdout")
+    parser.add_argument("--json", metavar="FILE", help="also write demo.json's content to this file; - is stdout")
     args = parser.parse_args(argv)
     try:
         files = RunFiles(args.out, args.artifacts or recorded_artifacts(args.out))
-        # Only the demo knows how long all of it took, and has left it in the demo.json of the first report.
+        # Only the demo knows its total duration, which is in the first report's demo.json.
         wall_s = seconds(files.summary, load_json(files.summary), "wall_s") if files.summary.exists() else 0.0
         summary = write_report(files, wall_s=wall_s)
         write_result(args.json, summary)

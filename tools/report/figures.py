@@ -1,4 +1,4 @@
-"""The report's pictures: RunData in, PNG bytes out. Drawn with matplotlib's object interface (no global state)."""
+"""Pictures of the report: RunData → PNG bytes, with matplotlib's object interface (no global state)."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ from reporting.plot_style import (
 )
 from tools.report.run_data import Array, Record, RunData, odometry_in_world
 
-OVERHEAD_KINDS = frozenset({"light", "sign"})  # nobody meets them on the floor
+OVERHEAD_KINDS = frozenset({"light", "sign"})  # not on the floor
 FLAT_KINDS = frozenset({"door", "window", "notice_board"})  # on a wall
 _DEADLINE_MS = 100.0
 
 
 def top_down(data: RunData) -> bytes:
-    """The whole scene from above: path among walls, objects and people; colour of the path is time."""
+    """Draw the scene from above: path among walls, objects and people; the path's colour is time."""
     corners = np.concatenate([np.asarray(f["polygon"], float) for f in data.trace.scene["footprints"]])
     corners = np.concatenate([corners, data.trace.pose[:, :2]])
     return _seen_from_above(data, corners.min(axis=0) - 0.5, corners.max(axis=0) + 0.5)
 
 
 def close_up(data: RunData) -> bytes | None:
-    """The same around the path alone; None when the path fills most of the whole picture anyway."""
+    """Draw the scene around the path; None if the path fills most of the whole picture."""
     scene = np.concatenate([np.asarray(f["polygon"], float) for f in data.trace.scene["footprints"]])
     low, high = data.trace.pose[:, :2].min(axis=0) - 1.5, data.trace.pose[:, :2].max(axis=0) + 1.5
-    # Wide rather than tall, and never a strip: the page is wide.
+    # Wider than tall, because the page is wide, but not a strip.
     lack = np.maximum(0.0, np.array([2.2, 0.35]) * (high - low)[::-1] - (high - low)) / 2
     low = np.maximum(low - lack, scene.min(axis=0) - 0.4)
     high = np.minimum(high + lack, scene.max(axis=0) + 0.4)
@@ -81,7 +81,7 @@ def _seen_from_above(data: RunData, low: Array, high: Array) -> bytes:
 def _top_down_legend() -> list[Line2D]:
     return [
         Line2D([], [], color=TRUTH, linewidth=3, label="true path"),
-        Line2D([], [], color=COMMAND, linestyle=(0, (4, 2)), label="odometry, laid on at the first tick"),
+        Line2D([], [], color=COMMAND, linestyle=(0, (4, 2)), label="odometry, aligned at the first tick"),
         Line2D([], [], color=PERSON, linewidth=1.2, label="people (dot: at the end)"),
         Line2D([], [], color=GOOD, marker="o", linestyle="", markersize=8, label="start"),
         Line2D([], [], color="#b8860b", marker="*", linestyle="", markersize=11, label="goal"),
@@ -91,7 +91,7 @@ def _top_down_legend() -> list[Line2D]:
 
 def _draw_footprints(axes: Axes, footprints: Sequence[Record], points_per_m: float) -> None:
     middle = np.mean(np.concatenate([np.asarray(f["polygon"], float) for f in footprints]), axis=0)
-    label_end_m = {1: -np.inf, -1: -np.inf}  # where the last label on either side ends
+    label_end_m = {1: -np.inf, -1: -np.inf}  # end of the last label on each side
     for footprint in sorted(footprints, key=lambda f: float(np.mean([x for x, _ in f["polygon"]]))):
         polygon, kind = np.asarray(footprint["polygon"], float), footprint["kind"]
         if kind in OVERHEAD_KINDS:
@@ -113,9 +113,9 @@ def _draw_footprints(axes: Axes, footprints: Sequence[Record], points_per_m: flo
 
 
 def _label_on_wall(axes: Axes, text: str, polygon: Array, middle: Array) -> None:
-    """Doors and boards: beyond the wall they are on, so that the room stays free."""
+    """Label doors and boards beyond their wall, so that the room stays free."""
     centre, size = polygon.mean(axis=0), np.ptp(polygon, axis=0)
-    if size[1] > size[0]:  # on an end wall: there is more room inside
+    if size[1] > size[0]:  # on an end wall, inside, where there is more space
         inside = 1 if centre[0] < middle[0] else -1
         _annotate(axes, text, (centre[0], centre[1]), (inside * 4, 0), 6, MUTED)
         return
@@ -176,7 +176,7 @@ def _draw_start_goal(axes: Axes, scene: Record, end: Array) -> None:
 
 
 def tick_histogram(durations_ms: Array) -> bytes:
-    """Draw the duration of every control tick, ms; counts on a log scale, so that one outlier shows."""
+    """Draw the duration of every control tick, ms; counts on a log scale, so that one outlier is visible."""
     figure = new_figure(5.4, 3.1)
     axes = figure.add_subplot()
     right = max(_DEADLINE_MS * 1.1, float(durations_ms.max()) * 1.05)
@@ -193,7 +193,7 @@ def tick_histogram(durations_ms: Array) -> bytes:
 
 
 def time_line(data: RunData) -> bytes:
-    """Δt, forward speed and turn rate over the run; ticks that did not drive are shaded."""
+    """Draw Δt, forward speed and turn rate over the run; ticks that did not drive are shaded."""
     figure = new_figure(11.0, 6.2)
     delay, speed, turn = figure.subplots(3, 1, sharex=True)
     ticks = data.log.ticks
@@ -221,13 +221,13 @@ def time_line(data: RunData) -> bytes:
 
 
 def _smooth(values: Array, width: int = 10) -> Array:
-    """Moving mean over `width` samples (1 s of poses): a trotting body sways with every step."""
+    """Compute the moving mean over `width` samples (1 s of poses), because a trotting body sways with every step."""
     window = np.ones(width)
     return np.convolve(values, window, "same") / np.convolve(np.ones_like(values), window, "same")
 
 
 def _spans(time_s: Array, flags: Sequence[bool]) -> list[tuple[float, float]]:
-    """Runs of True as (start, end) times."""
+    """Return runs of True as (start, end) times."""
     spans: list[tuple[float, float]] = []
     begin: float | None = None
     for at_s, flag in zip(time_s, flags, strict=True):

@@ -1,4 +1,4 @@
-"""Facts about the machine a report was measured on; a number without them cannot be compared with another."""
+"""Facts about the measuring machine, without which numbers cannot be compared."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def machine_facts() -> dict[str, str]:
 
 
 def cpu_model(cpuinfo: Path = Path("/proc/cpuinfo")) -> str:
-    """Processor name as the kernel gives it (ARM boards have none there: the architecture instead)."""
+    """Return the processor's name from the kernel; on ARM boards, which have none, the architecture."""
     try:
         for line in cpuinfo.read_text(encoding="utf-8").splitlines():
             if line.startswith("model name"):

@@ -1,4 +1,4 @@
-"""The report's table of numbers: what was measured, how much it was, and which file says so."""
+"""Table of numbers of the report: quantity, value, source file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WIRE = "edge-hil, requests received"
 
 @dataclass(frozen=True)
 class Number:
-    """One row: `kind` is `measured` for what this run measured, `setting` for what it was asked for."""
+    """Row of the table; `kind` is `measured` for a result of this run, `setting` for an option."""
 
     title: str
     value: str
@@ -29,21 +29,21 @@ class Number:
 
 
 def headline(data: RunData) -> list[tuple[str, str]]:
-    """The few numbers on top: (value, what it is)."""
+    """Return the numbers at the top as (value, name)."""
     run = data.results["edge-run"]
     control, reasoning, delay_s = run["control"], run["reasoning"], run["delay_s"]
     return [
         (f"{control['ticks']}", f"control ticks in {data.duration_s:.0f} s"),
         (f"{control['tick_ms']['p99']:.1f} ms", "control tick, p99 (deadline 100 ms)"),
         (f"{reasoning['generations']}", "VLM generations"),
-        (f"{_value(delay_s['p50'])} s", "Δt the action expert drove with, p50"),
+        (f"{_value(delay_s['p50'])} s", "Δt of the action expert, p50"),
         (f"{moved_under_command_m(data.trace):.2f} m", "walked under command (ground truth)"),
         (f"{goal_distance_m(data):.2f} m", "from the goal at the end"),
     ]
 
 
 def odometry_error_m(data: RunData) -> float | None:
-    """Distance between odometry (laid on at the first tick) and ground truth at the last tick."""
+    """Return the distance between odometry (aligned at the first tick) and ground truth at the last tick, m."""
     stamps_ns, odometry = odometry_in_world(data)
     if not len(stamps_ns):
         return None
@@ -51,7 +51,7 @@ def odometry_error_m(data: RunData) -> float | None:
 
 
 def numbers(data: RunData, wall_s: float) -> list[Number]:
-    """All rows, in reading order."""
+    """Return all rows in reading order."""
     return [*_control(data), *_reasoning(data), *_robot(data), *_machine(data, wall_s)]
 
 
@@ -90,8 +90,8 @@ def _reasoning(data: RunData) -> list[Number]:
         Number("of which decoding, p50", _median(semantics, "decode_ms", "ms"), LOG),
         Number("of which semantic context, p50", _median(semantics, "context_ms", "ms"), LOG),
         Number("prompt tokens / new tokens, p50", _token_counts(semantics), LOG),
-        Number("release delay asked for", _release_delay(data), LOG, "setting"),
-        Number("release delay applied, p50", _median(semantics, "release_delay_s", "s", 2), LOG),
+        Number("requested release delay", _release_delay(data), LOG, "setting"),
+        Number("applied release delay, p50", _median(semantics, "release_delay_s", "s", 2), LOG),
         Number("Δt p50 / p99 / max", " / ".join(_value(delay_s[key]) for key in ("p50", "p99", "max")) + " s", RUNNER),
         delay_at_call(data),
         Number("texts with readable waypoints", f"{sum(1 for s in semantics if s['waypoints'])}", LOG),
@@ -99,10 +99,10 @@ def _reasoning(data: RunData) -> list[Number]:
 
 
 def delay_at_call(data: RunData) -> Number:
-    """How far Δt was off when the action expert was called, which is later than the clock was read for it.
+    """Return the error of Δt at the action expert's call, which is later than the clock reading.
 
-    On a busy machine the control thread may be preempted in between: a fact about the run, not the acceptance check,
-    which holds the recorded Δt against the recorded clock.
+    A busy machine may preempt the control thread in between. The acceptance check instead compares the recorded Δt with
+    the recorded clock.
     """
     worst_ms = data.results["edge-run"]["delay_error_ms"]["max"]
     value = "none" if worst_ms is None else f"{worst_ms:.2f} ms"

@@ -1,4 +1,4 @@
-"""Everything a report knows about one run: flight log, ground-truth trace and the results of the commands.
+"""Data of one run for its report: flight log, ground-truth trace and results of the commands.
 
 All stamps are monotonic ns of one machine, so the runner's ticks and the simulated robot's truth share one axis.
 """
@@ -21,16 +21,16 @@ Array = NDArray[np.float64]
 
 
 MISSHAPEN = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError)
-"""What reading a record raises when it lacks a field or holds something else there (numpy's errors included)."""
+"""Exceptions of reading a record with a missing or malformed field (including numpy's)."""
 
 
 class ReportError(ValueError):
-    """A file of the run is missing or is not what it should be; one clear line."""
+    """Missing or invalid file of the run; its text is one line."""
 
 
 @dataclass(frozen=True)
 class FlightLog:
-    """What the runner recorded; `frame_stamps_ns` are the log times of all recorded camera frames."""
+    """The runner's record; `frame_stamps_ns` are the log times of all recorded camera frames."""
 
     path: Path
     run: Record
@@ -40,7 +40,7 @@ class FlightLog:
 
     @property
     def tick_ms(self) -> Array:
-        """[ticks] from each tick's deadline to its command sent, in ms: a late wake-up counts."""
+        """[ticks] time from each tick's deadline to its sent command, ms; includes a late wake-up."""
         return np.array([tick["late_ms"] + tick["duration_ms"] for tick in self.ticks], float)
 
     @property
@@ -51,7 +51,7 @@ class FlightLog:
 
 @dataclass(frozen=True)
 class Trace:
-    """What the simulated robot's side saw: ground truth and the requests that arrived on the wire."""
+    """Record of the simulated robot's side: ground truth and received requests."""
 
     scene: Record
     pose_ns: NDArray[np.int64]
@@ -68,7 +68,7 @@ class Trace:
 
 @dataclass(frozen=True)
 class RunData:
-    """One run, complete: `settings` is what was asked for, `results` the JSON result per command name."""
+    """Complete data of a run; `settings`: its options, `results`: JSON result by command name."""
 
     settings: Record
     log: FlightLog
@@ -78,12 +78,12 @@ class RunData:
 
     @property
     def duration_s(self) -> float:
-        """Driving time that was asked for: a runner that gave up early must not lower its own limits."""
+        """Requested driving time, s; the actual one would lower the limits of a runner that ended early."""
         return float(self.settings["duration_s"])
 
 
 def load_json(path: Path) -> Record:
-    """One JSON object from a file; ReportError names the file otherwise."""
+    """Read a JSON object from a file. Raises ReportError that names the file."""
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -96,7 +96,7 @@ def load_json(path: Path) -> Record:
 
 
 def seconds(path: Path, record: Record, key: str) -> float:
-    """A time in s from `record`, as it was read from `path`; ReportError where there is none."""
+    """Return a time of `record` in s, which was read from `path`. Raises ReportError if it is missing."""
     value = record.get(key)
     if not isinstance(value, int | float) or not 0 <= value < math.inf:
         raise ReportError(f"{path}: expected a time in seconds under '{key}', found {value!r}")
@@ -104,7 +104,7 @@ def seconds(path: Path, record: Record, key: str) -> float:
 
 
 def load_flight_log(path: Path) -> FlightLog:
-    """The recorded run without the pictures' bytes (see `load_frames`)."""
+    """Read the recorded run without the pictures' bytes (see `load_frames`). Raises ReportError."""
     run: Record = {}
     ticks: list[Record] = []
     semantics: list[Record] = []
@@ -133,7 +133,7 @@ def load_flight_log(path: Path) -> FlightLog:
 
 
 def load_frames(path: Path, stamps_ns: set[int]) -> dict[int, bytes]:
-    """JPEG bytes of the camera frames with these stamps; a second pass, so that a long log never sits in memory."""
+    """Read the JPEG bytes of the camera frames with these stamps, in a second pass to save memory."""
     return {
         stamp_ns: jpeg_bytes(payload)
         for topic, stamp_ns, payload in read_messages(path)
@@ -142,7 +142,7 @@ def load_frames(path: Path, stamps_ns: set[int]) -> dict[int, bytes]:
 
 
 def load_trace(path: Path) -> Trace:
-    """Ground truth of edge-hil; a last line that was cut off is ignored, anything else wrong is a ReportError."""
+    """Read the ground truth of edge-hil; ignores an incomplete last line. Raises ReportError for other damage."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except FileNotFoundError:
@@ -181,23 +181,23 @@ def _trace(by_kind: dict[str, list[Record]]) -> Trace:
 
 
 def _body_velocity(poses: list[Record], theta: Array) -> Array:
-    """World-frame vx, vy turned into the body frame, [n, 3]."""
+    """Rotate world-frame velocities [n, 3] into the body frame."""
     vx, vy, wz = (np.array([float(p[key]) for p in poses]) for key in ("vx", "vy", "wz"))
     cos, sin = np.cos(theta), np.sin(theta)
     return np.column_stack([cos * vx + sin * vy, -sin * vx + cos * vy, wz])
 
 
 def truth_at(trace: Trace, stamps_ns: NDArray[np.int64]) -> Array:
-    """Ground-truth pose [n, 3] at these stamps, linear between the samples (theta is unwrapped)."""
+    """Interpolate the ground-truth pose [n, 3] linearly at these stamps (theta is unwrapped)."""
     base = trace.pose_ns[0]
     at, samples = (stamps_ns - base).astype(float), (trace.pose_ns - base).astype(float)
     return np.column_stack([np.interp(at, samples, trace.pose[:, axis]) for axis in range(3)])
 
 
 def odometry_in_world(data: RunData) -> tuple[NDArray[np.int64], Array]:
-    """The runner's odometry path laid onto the world at its first pose: stamps [n] and poses [n, 3].
+    """Align the runner's odometry path with the world at its first pose; returns stamps [n] and poses [n, 3].
 
-    `T_world_odom = T_world_base(t0) · T_odom_base(t0)⁻¹`; the distance that grows afterwards is odometry drift.
+    `T_world_odom = T_world_base(t0) · T_odom_base(t0)⁻¹`; the growing distance to the truth is odometry drift.
     """
     ticks = [tick for tick in data.log.ticks if tick["pose"] is not None]
     stamps_ns = np.array([tick["now_ns"] for tick in ticks], np.int64)

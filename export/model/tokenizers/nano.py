@@ -1,8 +1,8 @@
 """The `nano` tokenizer: byte-level BPE trained on the words of instructions and reasoning texts.
 
-A word is about one token and a coordinate two, sign and whole metres apart from the tenths, because in so small a model
+A word is about one token; a coordinate is two, one for sign and whole metres, one for the tenths. In so small a model
 every token costs time twice: it is prefilled or decoded, and the action expert reads its keys. `python -m
-export.model.tokenizers.nano` writes `nano_tokenizer.json` anew; the file is in the repository so that an export does
+export.model.tokenizers.nano` writes `nano_tokenizer.json` again; the file is in the repository so that an export does
 not depend on the trainer's version.
 """
 
@@ -25,13 +25,13 @@ PIECES = (
     r"|(?<=\.)\d+[,)]?"  # its "3,"
     r"| ?\d+:?"  # " 6", "Frame 1:"
     r"| ?\p{L}+:?"  # " door", "Plan:"
-    r"|\.?\n"  # a sentence's and a line's end are one
+    r"|\.?\n"  # the ends of sentence and line are one piece
     r"| ?[^\s\p{L}\p{N}]+"
     r"|\s+(?!\S)|\s+"
 )
-"""What a token is at most (the expression is Oniguruma's); every character is in one piece."""
+"""Largest piece of a token (Oniguruma syntax); every character belongs to one piece."""
 FARTHEST_M = 30
-"""Whole metres that are one token; farther ones take two or three."""
+"""Largest coordinate, m, whose whole metres are one token; larger ones take two or three."""
 
 _SPLIT = pre_tokenizers.Sequence(
     [
@@ -42,13 +42,13 @@ _SPLIT = pre_tokenizers.Sequence(
 
 
 def word_lists() -> dict[str, list[str]]:
-    """The words of `nano_words.toml` by list, each once, as they stand in the file."""
+    """Read the words of `nano_words.toml` by list, each once, in the file's order."""
     data = tomllib.loads(NANO_WORDS.read_text(encoding="utf-8"))
     return {key: list(dict.fromkeys(text.replace(",", " ").split())) for key, text in data.items()}
 
 
 def _numbers() -> Iterator[str]:
-    """Every piece of the ways, waypoints, distances and counts that are common."""
+    """Yield texts with every common piece of paths, waypoints, distances and counts."""
     for whole in range(FARTHEST_M + 1):
         yield from (f" ({whole}.5, {whole}.5)", f" (-{whole}.5, -{whole}.5)", f" {whole}", f" {whole}.")
     for tenth in range(10):
@@ -58,14 +58,14 @@ def _numbers() -> Iterator[str]:
 
 
 def train(vocab: int) -> Tokenizer:
-    """The tokenizer: the special tokens take ids 0…5, any text survives a round trip.
+    """Train the tokenizer: special tokens have ids 0…5; decoding an encoded text returns the text.
 
-    Words that the robot's sentences are made of are tokens as wholes; the room they leave in the vocabulary goes to the
-    merges of byte-level BPE, trained on all the lists, from which every other text is made.
+    Words of the reasoning text's sentences are whole tokens. The rest of the vocabulary are merges of byte-level BPE,
+    trained on all lists, which encode every other text.
     """
     lists = word_lists()
     everyday = [f" {word}" for word in lists.pop("everyday")]
-    # A word stands after a space; the names of aspects and roles stand at the start of a line.
+    # A word follows a space; names of aspects and roles begin a line.
     starts = lists.pop("line_starts")
     ours = [f" {word}" for words in lists.values() for word in words] + [*starts, *_numbers(), ".\n"]
     wholes = list(dict.fromkeys(piece for text in ours for piece in _pieces(text)))
@@ -82,7 +82,7 @@ def train(vocab: int) -> Tokenizer:
     tokens = list(dict.fromkeys([*tokens, *wholes, *spare]))[:vocab]
     merges = [(first, second) for first, second in json.loads(base.to_str())["model"]["merges"]]
     ids = {token: index for index, token in enumerate(tokens)}
-    # A piece that is a token is taken as it is, without merges that lead to it.
+    # A piece that equals a token needs no merges.
     tokenizer = _tokenizer(models.BPE(vocab=ids, merges=merges, ignore_merges=True))
     tokenizer.add_special_tokens([AddedToken(token, special=True) for token in SPECIAL_TOKENS])
     return tokenizer
@@ -96,7 +96,7 @@ def _tokenizer(model: models.BPE) -> Tokenizer:
 
 
 def _pieces(text: str) -> list[str]:
-    """What a text is split into before any merge, byte-level."""
+    """Return the byte-level pieces of a text before merging."""
     return [piece for piece, _ in _SPLIT.pre_tokenize_str(text)]
 
 

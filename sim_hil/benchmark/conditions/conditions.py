@@ -129,7 +129,7 @@ class Conditions:
 
     @property
     def switches(self) -> SwitchOptions:
-        """Decoding rules and recoveries that a policy from artifacts is asked for."""
+        """Decoding rules and recoveries requested of a policy from artifacts."""
         return SwitchOptions.parse(self.decoding, self.recovery, self.stays)
 
     def with_defaults_of(self, decoding: Decoding, recovery: RecoverySwitch) -> Conditions:

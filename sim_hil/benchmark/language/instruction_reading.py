@@ -115,21 +115,21 @@ def untrue(text: str, route: RouteDescription) -> list[str]:
     for claim in claims:
         if claim.kind in ("turn", "cross"):
             if taken >= len(steps):
-                problems.append(f"says one turn too many: {claim.side}")
+                problems.append(f"one turn too many: {claim.side}")
                 continue
             problems += _wrong_step(claim, steps[taken])
             taken += 1
         elif claim.kind == "pass":
             problems += _wrong_pass(claim, route, steps, taken)
         elif claim.kind == "leave" and not route.leaves_room:
-            problems.append("says to leave a room, but the start is in none")
+            problems.append("leaves a room, but the start is in none")
         elif claim.kind == "end" and not (taken == len(steps) and route.goal_at_end):
-            problems.append("says to go to the end, but the goal is not there")
+            problems.append("goes to the end, but the goal is not there")
         elif claim.kind == "goal":
             if claim.name not in (route.goal_name, route.goal_bare):
-                problems.append(f"speaks of the {claim.name}, but the goal is the {route.goal_name}")
+                problems.append(f"goal: expected {route.goal_name}, found {claim.name}")
             if claim.side and claim.side != route.goal_side:
-                problems.append(f"says that the goal is on the {claim.side}, it is {route.goal_side or 'elsewhere'}")
+                problems.append(f"side of the goal: expected {route.goal_side or 'none'}, found {claim.side}")
     if taken < len(steps):
         problems.append(f"leaves out {len(steps) - taken} of {len(steps)} turns")
     if not any(claim.kind == "goal" for claim in claims):
@@ -140,25 +140,25 @@ def untrue(text: str, route: RouteDescription) -> list[str]:
 def _wrong_step(claim: Claim, step: Step) -> list[str]:
     where = f"turn into the {step.name}"
     if (claim.kind == "cross") != (step.kind == "crossing"):
-        return [f"{where}: says {claim.kind}, it is a {step.kind}"]
+        return [f"{where}: expected {step.kind}, found {claim.kind}"]
     if claim.side != step.side:
-        return [f"{where}: says {claim.side}, it is {step.side}"]
+        return [f"{where}: expected {step.side}, found {claim.side}"]
     found = []
     if claim.ordinal and claim.ordinal != step.ordinal:
-        found.append(f"{where}: says number {claim.ordinal}, it is number {step.ordinal}")
+        found.append(f"{where}: expected number {step.ordinal}, found {claim.ordinal}")
     if claim.at_end and not step.at_end:
-        found.append(f"{where}: says that it is at the end, it is not")
+        found.append(f"{where}: is not at the end")
     if claim.noun == "named":
         if claim.name != step.name:
-            found.append(f"{where}: says {claim.name}")
+            found.append(f"{where}: found {claim.name}")
     elif claim.noun and claim.noun != _counted_as(step.kind):
-        found.append(f"{where}: says {claim.noun}, it is a {step.kind}")
+        found.append(f"{where}: expected {step.kind}, found {claim.noun}")
     elif claim.name and claim.name not in [thing.name for thing in step.near]:
         found.append(f"{where}: the {claim.name} does not mark it")
     # A turn without count, end or landmark must be the only possible one: out of a room, or off a crossing.
     bare = not (claim.ordinal or claim.at_end or claim.name or claim.noun)
     if claim.kind == "turn" and bare and step.before_kind not in ("room", "crossing", "plaza"):
-        found.append(f"{where}: does not say which")
+        found.append(f"{where}: is ambiguous")
     return found
 
 

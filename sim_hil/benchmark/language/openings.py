@@ -71,15 +71,15 @@ class Frame:
     direction: Vec2  # a unit vector along an axis
 
     def along(self, p: Vec2) -> float:
-        """Coordinate ahead, m."""
+        """Return the coordinate ahead, m."""
         return p[0] * self.direction[0] + p[1] * self.direction[1]
 
     def across(self, p: Vec2) -> float:
-        """Coordinate to the left, m."""
+        """Return the coordinate to the left, m."""
         return p[1] * self.direction[0] - p[0] * self.direction[1]
 
     def point(self, along: float, across: float) -> Vec2:
-        """World point of the two coordinates."""
+        """Return the world point of the two coordinates."""
         dx, dy = self.direction
         return (along * dx - across * dy, along * dy + across * dx)
 

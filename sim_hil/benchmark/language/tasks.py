@@ -27,13 +27,13 @@ _NOT_GOALS = frozenset(("notice_board", "window", "trash_bin", "medical_cart", "
 
 @dataclass(frozen=True)
 class Task:
-    """Task; `path`: shortest path from `start` to `goal`, m, for the grid's robot; `told`: its description."""
+    """Task; `path`: shortest path from `start` to `goal`, m, for the grid's robot; `route`: its description."""
 
     start: Vec3
     goal: Vec2
     goal_label: str
     path: tuple[Vec2, ...]
-    told: RouteDescription
+    route: RouteDescription
 
 
 def goal_before(grid: NavGrid, thing: SceneObject) -> Vec2 | None:
@@ -58,12 +58,12 @@ def make_task(scene: Scene, grid: NavGrid, start: Vec3, thing: SceneObject) -> T
         raise RouteError(f"there is no room before the {thing.landmark}")
     path = grid.path((start[0], start[1]), goal)
     if path is None:
-        raise RouteError(f"there is no way to the {thing.landmark}")
+        raise RouteError(f"there is no path to the {thing.landmark}")
     if thing.kind in _FREE_STANDING:
         goal = _first_beside(grid, thing, path) or goal
         path = grid.path((start[0], start[1]), goal)
         if path is None:
-            raise RouteError(f"there is no way to the {thing.landmark}")
+            raise RouteError(f"there is no path to the {thing.landmark}")
     route = describe_route(scene, grid, path, thing)
     return Task(start, goal, thing.label, tuple(path), route)
 
@@ -154,12 +154,12 @@ def sample_task(
 
 
 def _facing(task: Task) -> Task:
-    """The same task, the robot looking where it must go; raises RouteError when the way begins beside it."""
+    """Turn the robot towards the beginning of its route. Raises RouteError if the route begins sideways."""
     start = task.start
     away = _first_direction(task.path)
-    if task.told.leaves_room:  # stand so that the door is ahead
+    if task.route.leaves_room:  # face the door
         return replace(task, start=(start[0], start[1], round(away, 3)))
-    if abs(_wrapped(away - start[2])) > pi / 2:  # look the other way along the corridor
+    if abs(_wrapped(away - start[2])) > pi / 2:  # face the opposite direction of the corridor
         start = (start[0], start[1], _wrapped(start[2] + pi))
     task = replace(task, start=start)
     if not begins_ahead(task):
@@ -168,12 +168,12 @@ def _facing(task: Task) -> Task:
 
 
 def begins_ahead(task: Task) -> bool:
-    """Whether the robot looks where its way begins: words that say "go on" are true only then."""
+    """Return whether the route begins ahead of the robot; only then an instruction may begin with "go on"."""
     return abs(_wrapped(_first_direction(task.path) - task.start[2])) <= pi / 3
 
 
 def _first_direction(path: tuple[Vec2, ...]) -> float:
-    """Where a path leads in its first two metres."""
+    """Return the direction of a path's first two metres, rad."""
     left, at = 2.0, path[0]
     for a, b in itertools.pairwise(path):
         length = hypot(b[0] - a[0], b[1] - a[1])

@@ -33,7 +33,7 @@ class Sightlines:
         self._boxes = np.array(rows, dtype=np.float64).reshape(-1, 8)
 
     def pixels(self, eye: tuple[float, float, float], heading_rad: float, thing: SceneObject, range_m: float) -> float:
-        """Return the visible area of a thing's bounding box, px of a 128 x 128 image; 0 beyond the range."""
+        """Return the visible area of an object's bounding box, px of a 128 x 128 image; 0 beyond the range."""
         c, s = cos(heading_rad), sin(heading_rad)
         dx, dy = thing.position_m[0] - eye[0], thing.position_m[1] - eye[1]
         reach = float(np.hypot(*thing.size_m[:2])) / 2
@@ -58,7 +58,7 @@ class Sightlines:
         return float(np.sum(scale * areas[seen] / depth[seen] ** 3))
 
     def most_pixels(self, path: Iterable[tuple[float, float, float]], thing: SceneObject, range_m: float) -> float:
-        """Return the largest area of a thing in the images along poses (x m, y m, heading rad), px."""
+        """Return the largest area of an object in the images along poses (x m, y m, heading rad), px."""
         return max((self.pixels((x, y, EYE_M), heading, thing, range_m) for x, y, heading in path), default=0.0)
 
 

@@ -35,7 +35,7 @@ from firmware_bridge.core.config import RobotConfig
 from sim_hil.benchmark.conditions.conditions import ConditionsError
 from sim_hil.benchmark.conditions.latency import LatencyProfile, LatencySampler
 from sim_hil.benchmark.env.observation import Observation
-from sim_hil.benchmark.policies.lockstep_reasoner import VirtualTimeReasoner
+from sim_hil.benchmark.policies.virtual_time_reasoner import VirtualTimeReasoner
 from sim_hil.benchmark.suite.episode import Episode
 
 CONTROL_PERIOD_NS = 100_000_000

@@ -47,7 +47,7 @@ class Wanted:
     def fits(self, scene: Scene, task: Task) -> bool:
         """Return whether a drawn task meets the requirements."""
         thing = next(thing for thing in scene.objects if thing.label == task.goal_label)
-        route = task.told
+        route = task.route
         turns = sum(step.side != "straight" or step.kind == "crossing" for step in route.steps)
         return (
             thing.kind in self.kinds
@@ -121,7 +121,7 @@ def build_part(part: Part, progress: Callable[[str], None] = lambda line: None) 
     episodes: list[Episode] = []
     for index, (wanted, task) in enumerate(_tasks(part, scene)):
         name = f"{part.scene}-{wanted.task}"
-        progress(f"{name}: {task.told.length_m:.1f} m, {len(task.told.steps)} steps")
+        progress(f"{name}: {task.route.length_m:.1f} m, {len(task.route.steps)} steps")
         texts = tuple(_wordings(task, part.seed * 1000 + index))
         lengths = {robot: round(grids[robot].distance_m(task.start[:2], task.goal), 3) for robot in ROBOTS}
         for number, people in enumerate(part.crowds[index]):
@@ -141,7 +141,7 @@ def build_part(part: Part, progress: Callable[[str], None] = lambda line: None) 
                     timeout_s=timeout_s(lengths[robot], people, part.scene == "sidewalk"),
                     threshold_m=part.threshold_m,
                     shortest_m=lengths[robot],
-                    landmarks=named_landmarks(texts, task.told),
+                    landmarks=named_landmarks(texts, task.route),
                     goal_landmark=task.goal_label,
                 )
             )
@@ -154,7 +154,7 @@ def build(progress: Callable[[str], None] = lambda line: None) -> str:
 
 
 def _wordings(task: Task, seed: int) -> list[str]:
-    return wordings(task.told, WORDINGS, seed, held_out=True)
+    return wordings(task.route, WORDINGS, seed, held_out=True)
 
 
 def _tasks(part: Part, scene: Scene) -> list[tuple[Wanted, Task]]:
@@ -187,11 +187,11 @@ def _is_valid(part: Part, scene: Scene, grid: NavGrid, lines: Sightlines, task: 
         texts = _wordings(task, seed)
     except WordingError:
         return False
-    if any(untrue(text, task.told) for text in texts):
+    if any(untrue(text, task.route) for text in texts):
         return False
-    if worst_leak(grid, task.goal, part.threshold_m) > 0 or wrong_bends(task.told, task.path):
+    if worst_leak(grid, task.goal, part.threshold_m) > 0 or wrong_bends(task.route, task.path):
         return False
-    return not named_too_small(scene, lines, task.path, named_landmarks(texts, task.told))
+    return not named_too_small(scene, lines, task.path, named_landmarks(texts, task.route))
 
 
 def _print_progress(line: str) -> None:

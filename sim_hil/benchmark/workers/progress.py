@@ -30,18 +30,18 @@ class BenchProgress(Progress):
         end = "reached" if result.success else result.end
         hit = f", collided with {', '.join(result.collisions)}" if result.collided else ""
         took = f"{result.time_s:.0f} s simulated in {result.wall_s:.0f} s"
-        self.say(f"[{self._ended}/{self._episodes}] {result.id}: {end}, {result.ne_m:.1f} m from the goal{hit}; {took}")
+        self.log(f"[{self._ended}/{self._episodes}] {result.id}: {end}, {result.ne_m:.1f} m from the goal{hit}; {took}")
         self._reached += result.success
         self._collided += result.collided
         self._advance()
 
     def _failed(self, failed: FailedRun) -> None:
         self._ended += 1
-        self.say(f"[{self._ended}/{self._episodes}] {failed.id}: FAILED {failed.attempts} times: {failed.why}")
+        self.log(f"[{self._ended}/{self._episodes}] {failed.id}: FAILED {failed.attempts} times: {failed.why}")
         self._advance()
 
     def _retried(self, episode_id: str, why: str) -> None:
-        self.say(f"{episode_id}: runs again: {why}")
+        self.log(f"{episode_id}: runs again: {why}")
 
     def _advance(self) -> None:
         at = ", ".join(f"{time_s:.0f} s" for time_s in sorted(self._times.values(), reverse=True)[:SHOWN])

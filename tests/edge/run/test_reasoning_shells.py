@@ -18,7 +18,7 @@ from edge.state.ring import EncodedFrame, TokenRing
 from edge.state.semantic import SemanticSlot, SemanticState, SharedState
 from edge.state.switches import Decoding
 from sim_hil.benchmark.conditions.latency import Timing
-from sim_hil.benchmark.policies.lockstep_reasoner import VirtualTimeReasoner
+from sim_hil.benchmark.policies.virtual_time_reasoner import VirtualTimeReasoner
 from tests.support.runner.reasoning_bench import KV, TEXT, Bench, Clock, FakeLanguage, FakePolicy
 
 TICK_S = 0.1

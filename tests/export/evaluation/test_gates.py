@@ -156,7 +156,7 @@ def test_other_text_from_untrained_weights_says_nothing_but_their_plans_and_stat
 def test_plans_that_do_not_follow_the_semantic_state_warn_that_the_task_cannot_tell(semantic: float | None) -> None:
     verdict = judge(GOOD, replace(STEADY, semantic=semantic), GATE, TASK_GATE)
     assert verdict.level == "WARN"
-    assert "hardly follow the semantic state" in verdict.reasons[0]
+    assert "hardly depend on the semantic state" in verdict.reasons[0]
 
 
 def test_thresholds_that_a_target_does_not_give_do_not_judge() -> None:

@@ -110,7 +110,7 @@ DAMAGED: dict[str, tuple[Damage, str]] = {
     ),
     "weights that are others": (
         lambda d: edit(d, lambda m: m["provenance"].update(weights_sha256="0" * 64)),
-        "was made from other weights",
+        "built from other weights",
     ),
     "a session of nowhere": (
         lambda d: edit(d, lambda m: m["graphs"]["vision_encoder"].update(session={"provider": "x"})),
@@ -154,7 +154,7 @@ def test_a_damaged_directory_is_not_exported_over(
 
 WRONG_ARGUMENTS: list[tuple[list[str], str]] = [
     ([], "--out is missing"),
-    (["verify"], "which directory"),
+    (["verify"], "the directory is missing"),
     (["verify", "no-such-directory"], "not a directory"),
     (["verify", ".", "--target", "orin"], "--target has no effect"),
     (["verify", ".", "--model", "1b"], "--model has no effect"),

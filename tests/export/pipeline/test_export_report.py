@@ -127,7 +127,10 @@ def test_layers_that_were_searched_are_plotted(changed: dict[str, Any]) -> None:
     page = _Page(report_html(changed))
     text = page.text
     assert sum(tag == "img" for tag, _ in page.tags) == 2
-    assert "the 2 most sensitive groups of layers, each rounded alone to int8, filled: kept more exact" in text
+    assert (
+        "the 2 most sensitive groups of layers, each rounded alone to int8, filled: raised to a more exact precision"
+        in text
+    )
 
 
 def test_text_from_files_cannot_act_on_the_page(changed: dict[str, Any]) -> None:

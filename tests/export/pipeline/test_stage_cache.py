@@ -230,7 +230,7 @@ def test_a_directory_with_files_of_the_users_is_refused_and_not_touched(
     theirs = tmp_path / name
     theirs.parent.mkdir(exist_ok=True)
     theirs.write_text("mine")
-    with pytest.raises(CacheError, match="which no cache of ours does"), open_cache(tmp_path, 0, notes):
+    with pytest.raises(CacheError, match="which is not part of a cache"), open_cache(tmp_path, 0, notes):
         pass
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == [theirs]
 

@@ -34,7 +34,7 @@ def main() -> int:
         if name == how:
             raise TrainError(f"{name} has failed")
         if how == "stop" and name == "encoder" and here == "1":
-            job.stop.asked = True
+            job.stop.requested = True
         job.ranks.barrier()
         return {"stage": name}
 

@@ -36,7 +36,7 @@ class StopAfter(QuietProgress):
 
     def update(self, done: int, total: int, **numbers: float) -> None:
         if "loss" in numbers and done == self._steps:
-            self.flag.asked = True
+            self.flag.requested = True
 
 
 class DiesAt(QuietProgress):

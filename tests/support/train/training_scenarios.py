@@ -62,7 +62,7 @@ def drive_along(scenario: Scenario, drive_id: str = "a", *, motion: str = NO_PEO
     plain = made_up_drive(
         drive_id, len(poses), layout_seed=scenario.layout_seed, kind=scenario.kind, scene=scenario.scene.name,
         robot=scenario.episode.robot, goal_xy=scenario.episode.goal_xy, threshold_m=scenario.episode.threshold_m,
-        wordings=scenario.wordings, told=tuple(scenario.told_json()), traces=tuple(traces),
+        wordings=scenario.wordings, told=tuple(scenario.steps_json()), traces=tuple(traces),
     )  # fmt: skip
     state = np.zeros((len(poses), 3), np.float32)
     state[:, 0] = SPEED_MPS

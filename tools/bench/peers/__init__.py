@@ -1,1 +1,1 @@
-"""Other people's runtimes on our shapes and weights; they live in an environment of their own (`install.sh`)."""
+"""Benchmark of other runtimes on this project's shapes and weights, in a separate environment (`install.sh`)."""

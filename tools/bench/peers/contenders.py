@@ -1,4 +1,4 @@
-"""The contenders, what each of them computes, and the verdicts: medians over rounds, paired ratios, the bars."""
+"""Contenders with their tasks, and verdicts: medians over rounds, paired ratios, required ratios (bars)."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ from fnmatch import fnmatchcase
 
 OURS = "ours"
 OWN_STACK = frozenset({OURS, "genai", "onnxruntime"})
-"""Ours is built on ONNX Runtime: it and GenAI are measured, but the bars are against the best of the others."""
+"""Stacks on ONNX Runtime, like this project's: they are measured, but the bars compare with the best of the others."""
 
 TASKS = ("encoder", "action", "tick", "language")
 
 
 @dataclass(frozen=True)
 class Contender:
-    """One process: a runtime (`stack`), its form, the parts it opens and the options it opens them with."""
+    """One process: a runtime (`stack`) with its form, parts and options."""
 
     name: str
     stack: str
     parts: tuple[str, ...]
     options: Mapping[str, str] = field(default_factory=dict)
     assets: tuple[str, ...] = ()
-    """What `tools.bench.peers.models.prepare` has to have made."""
+    """Models that `tools.bench.peers.models.prepare` must build."""
     memory_only: bool = False
-    """Started only to see how much memory all parts take together."""
+    """Whether only the memory of all parts together is measured."""
 
     @property
     def tasks(self) -> tuple[str, ...]:
-        """What it is timed at."""
+        """Timed tasks."""
         if self.memory_only:
             return ()
         has = set(self.parts)
@@ -80,7 +80,7 @@ CONTENDERS = (
     _language("torch language bf16", "torch", "bf16"),
     _language("torch language int8", "torch", "int8"),
     _language("llama.cpp q4_0", "llama", "q4_0"),
-    # Repacked weights are a copy beside the mapped file: reading the file, or not repacking, may be leaner.
+    # Repacked weights are a copy beside the mapped file: reading the file, or not repacking, may need less memory.
     _language("llama.cpp q4_0 read", "llama", "q4_0", weights="read"),
     _language("llama.cpp q4_0 lean", "llama", "q4_0", extra_buffers="false"),
     _language("llama.cpp q8_0", "llama", "q8_0"),
@@ -106,7 +106,7 @@ CONTENDERS = (
 
 
 def chosen(patterns: Sequence[str]) -> list[Contender]:
-    """Contenders whose name matches one of the patterns (all without patterns); raises ValueError when none does."""
+    """Return contenders that match a pattern (all without patterns). Raises ValueError if none matches."""
     found = [c for c in CONTENDERS if not patterns or any(fnmatchcase(c.name, p) for p in patterns)]
     if not found:
         names = ", ".join(c.name for c in CONTENDERS)
@@ -115,12 +115,12 @@ def chosen(patterns: Sequence[str]) -> list[Contender]:
 
 
 Series = Mapping[str, Sequence[float]]
-"""Contender → one value a round, in the same rounds for all."""
+"""Contender → one value per round, in the same rounds for all."""
 
 
 @dataclass(frozen=True)
 class Metric:
-    """A measured quantity, its direction, and the bar that the issue sets (ratio against the best peer)."""
+    """Measured quantity, its direction, and the bar (required ratio to the best peer)."""
 
     key: str
     title: str
@@ -128,7 +128,7 @@ class Metric:
     higher_is_better: bool
     bar: float | None
     against_own_stack: bool = False
-    """Whether plain ONNX Runtime counts as a peer here (it does where the bar is about splitting, not the runtime)."""
+    """Whether plain ONNX Runtime counts as a peer: only if the bar is about splitting instead of the runtime."""
 
 
 METRICS = (
@@ -146,7 +146,7 @@ METRICS = (
 
 @dataclass(frozen=True)
 class Row:
-    """One contender in one metric."""
+    """Result of one contender in one metric."""
 
     contender: str
     median: float
@@ -159,19 +159,19 @@ class Row:
 
 @dataclass(frozen=True)
 class Verdict:
-    """One metric: its rows from best to worst and how ours stands against the best peer."""
+    """Verdict on one metric: rows from best to worst, and the ratio to the best peer."""
 
     metric: Metric
     rows: tuple[Row, ...]
     best_peer: str | None
     ratio: float | None
-    """How many times better ours is than the best peer (median of the paired ratios); None without one of the two."""
+    """Median of the paired ratios of the best peer and ours, above 1 if ours is better; None if one is missing."""
     reached: bool | None
-    """None where there is no bar or nothing to compare."""
+    """Whether the bar is reached; None without a bar or a comparison."""
 
 
 def paired_ratio(metric: Metric, ours: Sequence[float], peer: Sequence[float]) -> float:
-    """Median over rounds of how many times better ours is; raises ValueError when the rounds do not match."""
+    """Return the median ratio over rounds, above 1 if ours is better. Raises ValueError if the rounds do not match."""
     pairs = zip(ours, peer, strict=True)
     return statistics.median(o / p if metric.higher_is_better else p / o for o, p in pairs)
 
@@ -201,12 +201,12 @@ def judge(metric: Metric, series: Series, stacks: Mapping[str, str]) -> Verdict:
 
 
 def judge_all(series: Mapping[str, Series], stacks: Mapping[str, str]) -> list[Verdict]:
-    """Verdicts of every metric that was measured."""
+    """Judge every measured metric."""
     return [judge(metric, series[metric.key], stacks) for metric in METRICS if series.get(metric.key)]
 
 
 def verdict_text(verdict: Verdict) -> str:
-    """`1.31× (bar 1.1×: reached)` and the like."""
+    """Format a verdict, such as `1.31× (bar 1.1×: reached)`."""
     if verdict.ratio is None:
         return "not compared"
     text = f"{verdict.ratio:.2f}× against {verdict.best_peer}"
@@ -216,7 +216,7 @@ def verdict_text(verdict: Verdict) -> str:
 
 
 def markdown(verdicts: Sequence[Verdict], heading: str, notes: Sequence[str]) -> str:
-    """The summary as Markdown."""
+    """Format the summary as Markdown."""
     lines = [f"# {heading}", "", *(f"- {note}" for note in notes), "", "| | ours against the best peer |", "|---|---|"]
     lines += [f"| {v.metric.title} | {verdict_text(v)} |" for v in verdicts]
     for v in verdicts:

@@ -1,6 +1,6 @@
-"""The harness's side: worker processes and their memory, and rounds in which each is asked for every task once.
+"""Harness of the workers: processes, their memory, and rounds in which each worker runs every task once.
 
-The others idle meanwhile; foreign load is seen.
+Other workers idle meanwhile; load from other programs is measured.
 """
 
 from __future__ import annotations
@@ -17,28 +17,28 @@ from typing import Any
 from sim_hil.processes.child_process import ChildProcess, parse_message
 
 ROOT = Path(__file__).parents[3]
-"""The folder that holds the packages `tools` and `export`, which workers import by name."""
+"""Folder with the packages `tools` and `export`, which workers import."""
 
 END_S = 10.0
-"""Time that a worker has to end after it was asked to, s."""
+"""Timeout of a worker's end after the request, s."""
 ANSWER_S = 3600.0
-"""Time that a worker has for one answer, s: loading and a round of calls of the slowest model."""
+"""Timeout of a worker's answer, s: covers loading and a round of calls of the slowest model."""
 SAMPLE_S = 0.02
 
 
 class WorkerError(RuntimeError):
-    """A worker that refused, failed or died; the text is one line."""
+    """Worker that refused, failed or died; its text is one line."""
 
 
 def worker_command(python: Path, stack: str) -> list[str]:
-    """Command of a stack's worker under an interpreter; one worker serves a runtime and its GenAI pipeline."""
+    """Return the command of a stack's worker; one worker module serves a runtime and its GenAI pipeline."""
     module = {"genai": "onnxruntime", "openvino_genai": "openvino"}.get(stack, stack)
     return [str(python), "-m", f"tools.bench.peers.workers.{module}_worker", stack]
 
 
 @dataclass
 class Worker:
-    """One contender's process, pinned to `cores`; idle unless it is asked something."""
+    """Process of a contender, pinned to `cores`; idle without a request."""
 
     name: str
     command: Sequence[str]
@@ -50,7 +50,7 @@ class Worker:
         threads = str(len(self.cores))
         env = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": threads, "MKL_NUM_THREADS": threads}
         before = os.sched_getaffinity(0)
-        # A child inherits the affinity; its libraries count the cores when they are loaded.
+        # A child inherits the affinity, and its libraries count the cores when they are loaded.
         os.sched_setaffinity(0, self.cores)
         try:
             self._process = ChildProcess(self.command, log=self.log, env=env, new_session=True)
@@ -72,7 +72,7 @@ class Worker:
     def ask(self, message: Mapping[str, object]) -> dict[str, Any]:
         """Send a message and wait for its answer; raises WorkerError."""
         if not self._process.send(json.dumps(message).encode()):
-            raise WorkerError(f"{self.name}: the worker is gone; its log: {self.log}")
+            raise WorkerError(f"{self.name}: the worker has ended; its log: {self.log}")
         try:
             line = self._process.read_one(ANSWER_S)
         except TimeoutError as error:
@@ -90,14 +90,14 @@ class Worker:
 
 @dataclass(frozen=True)
 class Peak:
-    """Largest memory of a process, MB (10⁶ bytes)."""
+    """Peak memory of a process, MB (10⁶ bytes)."""
 
     rss_mb: float
-    """All resident pages, mapped weight files included (the kernel's own high-water mark)."""
+    """Resident pages, including mapped weight files (the kernel's high-water mark)."""
     pss_mb: float
-    """The same with shared pages divided by their users (sampled)."""
+    """Resident pages, with shared pages divided by their users (sampled)."""
     anon_mb: float
-    """Only what is not a copy of a file and could not be dropped (sampled)."""
+    """Anonymous pages, which are no copy of a file (sampled)."""
 
 
 def _kib(text: str, key: str) -> int:
@@ -108,7 +108,7 @@ def _kib(text: str, key: str) -> int:
 
 
 class MemoryWatch:
-    """Samples a process's memory in a thread of this process until the block is left."""
+    """Context manager that samples a process's memory in a thread."""
 
     def __init__(self, pid: int) -> None:
         self._folder = Path("/proc") / str(pid)
@@ -129,7 +129,7 @@ class MemoryWatch:
             try:
                 self._sample()
             except (OSError, WorkerError):
-                return  # the process is gone; `peak` raises
+                return  # the process has ended; `peak` raises
             time.sleep(SAMPLE_S)
 
     def _sample(self) -> None:
@@ -137,7 +137,7 @@ class MemoryWatch:
         self._pss_kib = max(self._pss_kib, _kib((self._folder / "smaps_rollup").read_text(), "Pss"))
 
     def peak(self) -> Peak:
-        """The peaks until now; raises WorkerError when the process is gone."""
+        """Return the peaks so far. Raises WorkerError if the process has ended."""
         try:
             self._sample()
             rss_kib = _kib((self._folder / "status").read_text(), "VmHWM")
@@ -147,18 +147,18 @@ class MemoryWatch:
 
 
 CALLS = {"action": 20}
-"""Calls of a sample where one takes milliseconds; the sample is their median."""
+"""Calls per sample of a task that takes milliseconds; the sample is their median."""
 FOREIGN_CORES = 0.1
-"""Processor time of others, in cores, from which a sample counts as disturbed."""
+"""Load of other programs above which a sample counts as disturbed, cores."""
 GRAIN_S = 0.02
-"""The kernel counts busy time in steps of 0.01 s: a short sample must not be blamed for the steps at its ends."""
+"""Tolerance, s: the kernel counts busy time in steps of 0.01 s, which matters for short samples."""
 SETTLE_S = 0.3
-"""Runtimes keep their threads spinning for up to 0.2 s after a call: the next contender waits that out."""
+"""Pause before the next contender, s: runtimes keep their threads spinning for up to 0.2 s after a call."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One contender, one task, once."""
+    """One measurement of one task of a contender."""
 
     contender: str
     task: str
@@ -171,7 +171,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Round:
-    """All samples of a round in the order they were taken."""
+    """Samples of a round in the order of measurement."""
 
     group: str
     index: int
@@ -182,16 +182,16 @@ class Round:
 
     @property
     def quiet(self) -> bool:
-        """Whether nothing else took part of the machine."""
+        """Whether no other program disturbed the round."""
         return max([self.idle_foreign_cores, *(s.foreign_cores for s in self.samples)]) <= FOREIGN_CORES
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON form."""
+        """Return the plain JSON form."""
         return {**asdict(self), "quiet": self.quiet}
 
 
 def busy_s(stat: str) -> float:
-    """Seconds that all cores together were busy or stolen by the host, from the text of /proc/stat."""
+    """Return the time all cores together were busy or stolen by the host, s, from the text of /proc/stat."""
     fields = next(line.split()[1:] for line in stat.splitlines() if line.startswith("cpu "))
     user, nice, system, _idle, _iowait, irq, softirq, steal = (int(v) for v in fields[:8])
     return (user + nice + system + irq + softirq + steal) / os.sysconf("SC_CLK_TCK")
@@ -202,7 +202,7 @@ def _machine_busy_s() -> float:
 
 
 def idle_foreign_cores(window_s: float) -> float:
-    """Cores busy during a window in which no contender works."""
+    """Measure the busy cores during a window without contenders."""
     before, started_ns = _machine_busy_s(), time.monotonic_ns()
     time.sleep(window_s)
     return (_machine_busy_s() - before) / ((time.monotonic_ns() - started_ns) / 1e9)
@@ -218,12 +218,12 @@ def wait_for_quiet(limit_s: float) -> float:
 
 
 def middle(values: Sequence[float]) -> float:
-    """The upper median: a value that occurred."""
+    """Return the upper median, which is one of the values."""
     return sorted(values)[len(values) // 2]
 
 
 def take(worker: Worker, task: str) -> Sample:
-    """Ask a contender for one sample; raises WorkerError."""
+    """Take one sample of a contender. Raises WorkerError."""
     time.sleep(SETTLE_S)
     before, started_ns = _machine_busy_s(), time.monotonic_ns()
     answer = worker.ask({"run": task, "calls": CALLS.get(task, 1)})
@@ -240,12 +240,12 @@ def run_rounds(
     quiet_wait_s: float,
     failed: Callable[[str, str], None],
 ) -> Iterator[Round]:
-    """Rounds until `repeats` were quiet, at most half as many again; a contender that fails leaves the field."""
+    """Run rounds until `repeats` were quiet, at most 1.5 times as many; a contender that fails is removed."""
     alive = dict(workers)
     for worker, tasks in list(alive.values()):
         try:
             for task in tasks:
-                take(worker, task)  # warm-up: first calls allocate, page in and compile
+                take(worker, task)  # warm-up: first calls allocate memory, load pages and compile
         except WorkerError as error:
             failed(worker.name, str(error))
             del alive[worker.name]
@@ -256,7 +256,7 @@ def run_rounds(
         foreign = wait_for_quiet(quiet_wait_s)
         load = os.getloadavg()
         names = list(alive)
-        # Every contender gets every place in the order: no contender always follows the same hot neighbour.
+        # Rotate the order, so that no contender always follows the same one on a hot processor.
         order = names[index % len(names) :] + names[: index % len(names)]
         samples: list[Sample] = []
         for name in order:

@@ -1,4 +1,4 @@
-"""What every contender computes: shapes of one frame, one prompt and one control step, and seeded inputs for them."""
+"""Workload of every contender: shapes of a frame, a prompt and a control step, with seeded inputs."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ class Workload:
 
     @property
     def semantic_tokens(self) -> int:
-        """Tokens of the semantic state that the action expert attends to: the prompt and what was decoded."""
+        """Tokens of the semantic state that the action expert reads: prompt and decoded tokens."""
         return self.prompt_tokens + DECODE_STEPS
 
     def frame(self, index: int = 0) -> npt.NDArray[np.uint8]:
-        """A frame [1, px, px, 3]: smooth colour gradients under noise, so that activations are not those of noise."""
+        """Build a frame [1, px, px, 3] of smooth gradients with noise; pure noise has untypical activations."""
         px = self.config.vision.image_px
         rng = np.random.default_rng([SEED, index])
         corners = rng.uniform(0, 255, (2, 2, 3))
@@ -54,19 +54,19 @@ class Workload:
         return frame[None]
 
     def text_ids(self, count: int) -> npt.NDArray[np.int64]:
-        """`count` ids of ordinary text tokens."""
+        """Return `count` ids of ordinary text tokens."""
         c = self.config.language
         special = (c.im_start_id, c.im_end_id, c.img_start_id, c.img_end_id, c.img_context_id)
         low, high = (0, min(special)) if min(special) > c.vocab // 2 else (max(special) + 1, c.vocab)
         return np.random.default_rng(SEED).integers(low, high, count).astype(np.int64)
 
     def last_layer_kv(self) -> npt.NDArray[np.float32]:
-        """A semantic state [1, T, kv_dim]."""
+        """Build a semantic state [1, T, kv_dim]."""
         shape = (1, self.semantic_tokens, self.config.kv_dim)
         return np.random.default_rng(SEED + 1).standard_normal(shape).astype(np.float32)
 
     def action_inputs(self) -> dict[str, npt.NDArray[np.float32]]:
-        """Inputs of the unsplit action expert in their order; latency is Δt, Δx, Δy, Δθ."""
+        """Build the inputs of the unsplit action expert in order; latency is Δt, Δx, Δy, Δθ."""
         shape = (1, self.config.vision.tokens, self.config.vision.token_dim)
         return {
             "visual_tokens": np.random.default_rng(2).standard_normal(shape).astype(np.float32),

@@ -1,4 +1,4 @@
-"""Walks of the simulated Go2 for the drift benchmark: truth, what its sensors would say, and what its camera sees.
+"""Walks of the simulated Go2 for the drift benchmark: truth, sensor readings and camera frames.
 
 Full leg physics (sim_hil.Simulation): the body bobs, rolls, slips and sways as the trot makes it. The camera is
 sim_hil's, drawn at the simulated instant, compressed as JPEG like the robot's own and decoded by the runner's code.
@@ -26,7 +26,7 @@ from sim_hil.simulation.physics import Simulation, SportAction
 STATE_NS = 20_000_000
 FRAME_NS = 100_000_000
 CAMERA_DELAY_NS = 100_000_000
-"""From the picture to the visual motion in the estimator: transport and computing."""
+"""Delay from the picture to the visual motion in the estimator (transport and computing)."""
 SIZE_PX = (320, 180)
 JPEG_QUALITY = 85
 STAND_S = 3.0
@@ -42,7 +42,7 @@ CAMERA = CameraGeometry(
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """What is added to the simulator's ideal sensors; every number is per run (a draw) or white.
+    """Noise added to the simulator's ideal sensors; every number is drawn per run or white.
 
     The gyro's white noise is twice, its bias four times what a BMI088's data sheet promises after zeroing
     (0.014 °/s/√Hz, 0.05 °/s-class drift); the mounting errors are what a hand calibration leaves.
@@ -55,12 +55,12 @@ class SensorNoise:
     camera_height: float = 0.003
     """Relative error of the height in the robot file."""
     stamp_ns: float = 2e6
-    """Of a frame's capture stamp."""
+    """Error of a frame's capture stamp."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One state at 50 Hz: truth, and the sensors that odometry noise does not touch."""
+    """State at 50 Hz: truth, and the sensors without odometry noise."""
 
     stamp_ns: int
     T_world_base: SE2
@@ -74,7 +74,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Walk:
-    """One recorded walk, with the visual motions computed on the way."""
+    """Recorded walk with its visual motions."""
 
     seed: int
     samples: tuple[Sample, ...]
@@ -86,7 +86,7 @@ class Walk:
 
 
 class Pilot:
-    """Walks up and down a corridor along a random weaving line, seldom stopping, at changing speed."""
+    """Drives up and down a corridor along a random weaving line at changing speed, with rare stops."""
 
     def __init__(self, rng: np.random.Generator, x_range_m: tuple[float, float], half_width_m: float) -> None:
         self._rng = rng
@@ -98,7 +98,7 @@ class Pilot:
         self._until_s = 0.0
 
     def command(self, pose: SE2, time_s: float) -> tuple[float, float, float]:
-        """Body velocity (m/s, m/s, rad/s) for this pose."""
+        """Return the body velocity (m/s, m/s, rad/s) for a pose."""
         if time_s >= self._until_s:
             self._target_y = float(self._rng.uniform(-self._half_width_m, self._half_width_m))
             self._speed = float(self._rng.uniform(0.4, 0.75))
@@ -114,7 +114,7 @@ class Pilot:
 
 
 def record_walk(scene: Scene, seed: int, *, distance_m: float, people: int, noise: SensorNoise) -> Walk:
-    """Walk until `distance_m` has been covered, watching with the camera. Raises RuntimeError when the robot falls."""
+    """Walk `distance_m` with the camera on. Raises RuntimeError if the robot falls."""
     rng = np.random.default_rng((seed, 1))
     simulation = Simulation(scene, people=people, seed=seed)
     world: CameraWorld | None = None
@@ -182,7 +182,7 @@ def _record(
 def look(
     eye: VisualOdometry, picture: NDArray[np.uint8], stamp_ns: int, attitude: Attitude
 ) -> tuple[VisualMotion | None, float]:
-    """One frame through JPEG into the visual odometry; how long decoding and step took, ms of this thread's time."""
+    """Pass a frame through JPEG to the visual odometry; returns motion and computing time, ms of this thread."""
     bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
     done, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not done:

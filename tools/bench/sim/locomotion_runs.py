@@ -1,4 +1,4 @@
-"""The locomotion table: ground for the Go2, and its single runs, one function each and deterministic."""
+"""Courses and runs of the locomotion table, one deterministic function per run."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ COMMAND_EVERY_S = 0.1  # a client repeats its command: the robot forgets one aft
 BUMP_M, BUMP_LENGTH_M, BUMP_EVERY_M = 0.05, 0.30, 0.9
 RAMP_RAD = radians(8.0)
 RAMP_START_M, RAMP_LENGTH_M, PLATEAU_M = 1.5, 6.0, 2.0
-FRICTION = 0.9  # of every floor of ours, see sim_hil/simulation/physics.py
+FRICTION = 0.9  # of every floor, see sim_hil/simulation/physics.py
 GROUNDS = ("flat", "bumps", "ramp")
 SETTLE_S, MEASURE_S = 2.5, 3.0
 REL_BOUND = 0.10
@@ -46,8 +46,8 @@ ROUTES: Final[dict[str, tuple[str, tuple[tuple[Command, float], ...], Command, f
     "ramp turning": ("ramp", (((0.6, 0.0, 0.0), 7.5), ((0.0, 0.0, 0.6), 1.0)), (0.0, 0.0, 0.6), 2 * pi / 0.6),
 }  # fmt: skip
 PUSH_S: Final = 0.1
-# (name, command while pushed, force in the world frame, N; the robot looks along x): small ones it takes, large ones
-# topple it.
+# (name, command while pushed, force in the world frame, N; the robot faces x). It withstands small pushes and falls
+# after large ones.
 PUSHES: Final[tuple[tuple[str, Command, tuple[float, float, float], bool], ...]] = (
     ("standing, from the side", (0.0, 0.0, 0.0), (0.0, 80.0, 0.0), False),
     ("standing, from behind", (0.0, 0.0, 0.0), (100.0, 0.0, 0.0), False),
@@ -81,7 +81,7 @@ def add_box(client: int, centre: Vec3, size: Vec3, pitch_rad: float, friction: f
 
 @dataclass(frozen=True)
 class Walked:
-    """What a command achieved: means over the measured time (m/s, m/s, rad/s), and the worst of it."""
+    """Achieved motion of a command: means over the measured time (m/s, m/s, rad/s), and worst values."""
 
     achieved: Command
     tilt_rad: float
@@ -135,7 +135,7 @@ class Course:
             self._slab(top + PLATEAU_M + run / 2, rise / 2, RAMP_RAD)
 
     def _slab(self, x_m: float, z_m: float, pitch_rad: float) -> None:
-        """A slab 1 m thick of a ramp's length whose top is centred on (x, 0, z)."""
+        """Add a slab 1 m thick with a ramp's length; its top is centred on (x, 0, z)."""
         centre = (x_m - 0.5 * sin(pitch_rad), 0.0, z_m - 0.5 * cos(pitch_rad))
         self._box(centre, (RAMP_LENGTH_M, 12.0, 1.0), pitch_rad)
 
@@ -143,7 +143,7 @@ class Course:
         add_box(self.client, centre, size, pitch_rad, FRICTION)
 
     def step(self) -> None:
-        """One step of physics."""
+        """Advance the physics by one step."""
         self.robot.drive()
         pybullet.stepSimulation(physicsClientId=self.client)
         self.robot.observe()
@@ -152,12 +152,12 @@ class Course:
         self.fell = self.fell or self.robot.up() < 0.5
 
     def wait(self, seconds: float) -> None:
-        """Let time pass."""
+        """Advance the simulation by `seconds`."""
         for _ in range(round(seconds * self.rate_hz)):
             self.step()
 
     def stand(self, timeout_s: float = 15.0) -> bool:
-        """Ask it to stand until it is ready; False when it is not after `timeout_s`."""
+        """Request standing until the robot is ready; returns False if it is not after `timeout_s`."""
         until = self.time_s + timeout_s
         while not self.robot.ready and self.time_s < until:
             self.robot.stand()
@@ -200,13 +200,13 @@ class Course:
 
 @dataclass(frozen=True)
 class Row:
-    """One command of the table (vx m/s, vy m/s, wz rad/s), and what came of it."""
+    """Command of the table (vx m/s, vy m/s, wz rad/s) with its result."""
 
     name: str
     commanded: Command
     achieved: Command
     error_share: float
-    """The worst component's error as a share of its command; of components commanded more than `ABS_BOUND`."""
+    """Largest relative error of a component with a command above `ABS_BOUND`."""
     tilt_rad: float
     torque_share: float
     fell: bool
@@ -215,7 +215,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Endured:
-    """One walk under random commands."""
+    """Result of a walk under random commands."""
 
     seed: int
     minutes: float
@@ -232,7 +232,7 @@ class Endured:
 
 @dataclass(frozen=True)
 class Pushed:
-    """One push: whether it fell, when it had gone limp, and how long RecoveryStand took from the ground."""
+    """Result of a push: fall, time until the motors were limp, duration of RecoveryStand."""
 
     name: str
     impulse_ns: float
@@ -244,13 +244,13 @@ class Pushed:
 
     @property
     def kept(self) -> bool:
-        """Whether the small push was taken, or the large one recovered from."""
+        """Whether the robot withstood the small push, or recovered from the large one."""
         return self.fell == self.should_fall and self.recovered
 
 
 @dataclass(frozen=True)
 class Speed:
-    """What a trot at 0.6 m/s costs this process, medians over its steps; the processor's time, not the wall's."""
+    """Processor time of a trot at 0.6 m/s in this process, medians over its steps."""
 
     rate_hz: int
     sim_s_per_cpu_s: float
@@ -275,7 +275,7 @@ def as_row(name: str, commanded: Command, walked: Walked) -> Row:
 
 
 def track(command: Command, rate_hz: int) -> Row:
-    """One command on flat ground."""
+    """Run one command on flat ground."""
     with Course("flat", rate_hz) as course:
         course.stand()
         course.walk(command, SETTLE_S)
@@ -283,7 +283,7 @@ def track(command: Command, rate_hz: int) -> Row:
 
 
 def travel(name: str, rate_hz: int) -> Row:
-    """One of ROUTES."""
+    """Run one of ROUTES."""
     ground, before, command, seconds = ROUTES[name]
     with Course(ground, rate_hz) as course:
         course.stand()
@@ -293,7 +293,7 @@ def travel(name: str, rate_hz: int) -> Row:
 
 
 def endure(rate_hz: int, seed: int, seconds: float) -> Endured:
-    """Random commands of the whole envelope, each kept for 0.3 to 4 s, a fifth a stop; stands up after a fall."""
+    """Run random commands of the whole envelope for 0.3 to 4 s each, a fifth of them stops; stand up after a fall."""
     rng = np.random.default_rng((seed, 20))
     config = GaitConfig()
     commands, falls, tilt, path = 0, 0, 0.0, 0.0
@@ -321,7 +321,7 @@ def endure(rate_hz: int, seed: int, seconds: float) -> Endured:
 
 
 def push_over(index: int, rate_hz: int) -> Pushed:
-    """One of PUSHES, then RecoveryStand if it fell."""
+    """Run one of PUSHES, then RecoveryStand after a fall."""
     name, command, force, should_fall = PUSHES[index]
     impulse = PUSH_S * hypot(*force)
     with Course("flat", rate_hz) as course:

@@ -194,12 +194,12 @@ def draw_detour(site: Site, robot: str, task: Task, most_m: float, rng: np.rando
         x, y, _ = draw_start(site.scene, site.robot_grid(robot), rng)
     except RouteError:
         return None
-    return Detour((x, y), where * _LATEST * task.told.length_m, _LEAST_M + far * (most_m - _LEAST_M))
+    return Detour((x, y), where * _LATEST * task.route.length_m, _LEAST_M + far * (most_m - _LEAST_M))
 
 
 def wrong_opening(site: Site, robot: str, task: Task, rng: np.random.Generator) -> Detour | None:
     """Draw a detour into an opening near the correct one; None if there is none."""
-    choices = [(step, opening) for step in task.told.steps for opening in _others(site, step)]
+    choices = [(step, opening) for step in task.route.steps for opening in _others(site, step)]
     if not choices:
         return None
     step, opening = choices[int(rng.integers(len(choices)))]

@@ -232,7 +232,7 @@ def _about(scenario: Scenario, drive_id: str, recorded: Recorded, driver: str, d
         outcome=recorded.outcome,
         collided=recorded.collided,
         wordings=scenario.wordings,
-        told=tuple(scenario.told_json()),
+        told=tuple(scenario.steps_json()),
         traces=traces,
     )
 

@@ -60,7 +60,7 @@ class About:
     """Properties of a whole drive.
 
     `driver`: expert, expert-noise, tour, policy:<hash of the artifacts' manifest>, or imported. `outcome`: reached,
-    fell, timeout, cut or imported. `told`: steps of the described route (`Scenario.told_json`). `traces`: one per
+    fell, timeout, cut or imported. `told`: steps of the described route (`Scenario.steps_json`). `traces`: one per
     second, {k, situation, objects, motion, progress {step, steps, passed}, plan}.
     """
 

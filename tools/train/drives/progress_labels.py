@@ -40,7 +40,7 @@ class RouteProgress:
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        self._scene, self._steps = scenario.scene, scenario.told.steps
+        self._scene, self._steps = scenario.scene, scenario.route.steps
         self._points = _dense(scenario.task.path)
         self._grid = scenario.site.grid
         self._nearest, self._gap_m = _nearest_points(self._grid, self._points)

@@ -173,21 +173,21 @@ class Scenario:
         return self.site.scene
 
     @property
-    def told(self) -> RouteDescription:
+    def route(self) -> RouteDescription:
         """Description of its route."""
-        return self.task.told
+        return self.task.route
 
     @property
     def wordings(self) -> tuple[str, ...]:
         """Instructions that describe the route."""
         return self.episode.instructions
 
-    def told_json(self) -> list[dict[str, Any]]:
+    def steps_json(self) -> list[dict[str, Any]]:
         """Return the route's steps for a drive's header: side, kind, name, ordinal, at_end and position, m."""
         return [
             {"side": step.side, "kind": step.kind, "name": step.name, "ordinal": step.ordinal, "at_end": step.at_end,
              "at": [round(v, 3) for v in step.at]}
-            for step in self.told.steps
+            for step in self.route.steps
         ]  # fmt: skip
 
 
@@ -279,12 +279,12 @@ def _scenario(site: Site, seed: int, number: int) -> Scenario:
 def scenario_of(site: Site, task: Task, wording_seed: int, robot: str, people: int, seed: int, number: int) -> Scenario:
     """Add true wordings, robot and crowd to a task. Raises RouteError if there is no wording or no path."""
     try:
-        texts = wordings(task.told, WORDINGS, wording_seed, held_out=False)
+        texts = wordings(task.route, WORDINGS, wording_seed, held_out=False)
     except WordingError as error:
         raise RouteError(str(error)) from error
-    if any(untrue(text, task.told) for text in texts):
+    if any(untrue(text, task.route) for text in texts):
         raise RouteError("a wording is not true of it")
-    if named_too_small(site.scene, site.lines, task.path, named_landmarks(texts, task.told)):
+    if named_too_small(site.scene, site.lines, task.path, named_landmarks(texts, task.route)):
         raise RouteError("something that is named is nowhere seen well")
     shortest_m = site.robot_grid(robot).distance_m(task.start[:2], task.goal)
     if not isfinite(shortest_m):
@@ -303,7 +303,7 @@ def scenario_of(site: Site, task: Task, wording_seed: int, robot: str, people: i
         timeout_s=timeout_s(shortest_m, people, site.outdoors),
         threshold_m=site.threshold_m,
         shortest_m=round(shortest_m, 3),
-        landmarks=named_landmarks(texts, task.told),
+        landmarks=named_landmarks(texts, task.route),
         goal_landmark=task.goal_label,
     )
     return Scenario(episode, task, site)
@@ -321,10 +321,10 @@ def _draw(site: Site, rng: np.random.Generator) -> Task:
 
 def _wanted(site: Site, task: Task, rng: np.random.Generator) -> bool:
     """Return whether to keep a task: randomly by its turns, and only if it is sound."""
-    told = task.told
+    steps = task.route.steps
     if not _long_enough(site, task):
         return False
-    worth = 0 if not told.steps else 2 if any(step.ordinal > 1 for step in told.steps) else 1
+    worth = 0 if not steps else 2 if any(step.ordinal > 1 for step in steps) else 1
     if site.kind != CORRIDOR and rng.uniform() >= _KEEP[worth]:
         return False
     return _unmistakable(site, task)
@@ -336,7 +336,7 @@ def is_sound(site: Site, task: Task) -> bool:
 
 
 def _long_enough(site: Site, task: Task) -> bool:
-    (x, y), steps = task.goal, task.told.steps
+    (x, y), steps = task.goal, task.route.steps
     if hypot(x - task.start[0], y - task.start[1]) < site.threshold_m + _LEAST_WAY_M:
         return False
     return not any(step.before_m < _LEAST_LEG_M for step in steps if step.before_kind != "room")
@@ -344,7 +344,7 @@ def _long_enough(site: Site, task: Task) -> bool:
 
 def _unmistakable(site: Site, task: Task) -> bool:
     """Return whether no point behind a wall counts as the goal, and the route bends where its description says."""
-    return worst_leak(site.grid, task.goal, site.threshold_m) <= 0 and not wrong_bends(task.told, task.path)
+    return worst_leak(site.grid, task.goal, site.threshold_m) <= 0 and not wrong_bends(task.route, task.path)
 
 
 def _at(place: float, choices: Sequence[tuple[_T, float]]) -> _T:

@@ -92,23 +92,23 @@ class Tracer:
         self, scenario: Scenario, progress: RouteProgress | None = None, lines: Sight | None = None
     ) -> None:  # fmt: skip
         """`lines`: sightlines to use instead of the site's."""
-        self._scene, told = scenario.scene, scenario.told
+        self._scene, route = scenario.scene, scenario.route
         self._lines: Sight = scenario.site.lines if lines is None else lines
         self.progress = RouteProgress(scenario) if progress is None else progress
         self._range_m = RANGE_OUTDOORS_M if scenario.site.outdoors else RANGE_INDOORS_M
         self._eye_ahead_m = MOUNTS[scenario.episode.robot].position_m[0]
         self._eye_up_m = _EYES_M[scenario.episode.robot]
-        along = [thing for step in told.steps for thing in (*step.near, *step.passed)]
-        self._named = frozenset(thing.label for thing in (*along, *told.passed))
-        self._goal = next(thing for thing in self._scene.objects if thing.label == told.goal_label)
+        along = [thing for step in route.steps for thing in (*step.near, *step.passed)]
+        self._named = frozenset(thing.label for thing in (*along, *route.passed))
+        self._goal = next(thing for thing in self._scene.objects if thing.label == route.goal_label)
         self._others = [thing for thing in self._scene.landmarks() if thing is not self._goal]
 
     def trace(
         self, pose: SE2, people: Array, velocities: Array, plan_xy: Sequence[Sequence[float]] | None = None
     ) -> ReasoningText:  # fmt: skip
-        """Of a true pose, people [n, 2 or 3] (x m, y m, ...) and their velocities [n, 2], m/s, in the world.
+        """Describe the scene at a true pose among people [n, 2 or 3] (x m, y m, ...) with world velocities [n, 2], m/s.
 
-        `plan_xy`: where the robot means to be in 3 s (and later), m in its own frame; only by it one sees it wait.
+        `plan_xy`: planned positions in 3 s (and later), m in the robot frame; without them waiting is not detected.
         """
         crowd = self._people_in_view(pose, people)
         progress, step = self.progress.at(pose), self.progress.next_step(pose)

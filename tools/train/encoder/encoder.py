@@ -44,7 +44,7 @@ def run(job: StageJob) -> dict[str, Any]:
     if config.frames.count:
         result = _train(job, config, network)
     else:
-        job.progress.say("frames.count is 0: the encoder is not trained")
+        job.progress.log("frames.count is 0: the encoder is not trained")
     if job.ranks.first:
         finish_network(job, STAGE, network)
     job.ranks.barrier()
@@ -57,7 +57,7 @@ def _train(job: StageJob, config: EncoderConfig, network: TicVla) -> dict[str, A
     folder = job.run_dir.stage(STAGE) / "frames"
     with job.ranks.by_first() as here:
         if here:
-            fill(folder, shards, config.frames.jobs, job.progress, lambda: job.stop.asked)
+            fill(folder, shards, config.frames.jobs, job.progress, lambda: job.stop.requested)
     data = FrameSet(folder, [shard for shard in shards if not shard.held])
     held = FrameSet(folder, [shard for shard in shards if shard.held])
     network.to(job.device)

@@ -113,17 +113,17 @@ class SceneLabels:
     def of(self, ids: Ids, view: View, people: Array, base_xy: tuple[float, float]) -> Labels:
         """Compute the labels of an instance image `ids` [PIXELS, PIXELS]; `people`: rows of the render state."""
         flat = ids.ravel().astype(np.int64)
-        who = flat - self.first_person
+        index = flat - self.first_person
         if flat.max(initial=0) >= self.first_person + len(people):
             raise ValueError(f"labels: the image contains number {flat.max()}, which no person has")
-        is_person = who >= 0
+        is_person = index >= 0
         known = np.where(is_person, 0, flat)
         classes = np.where(is_person, PERSON, self._classes[known])
         ranks = np.where(is_person, SOMEBODY, self._ranks[known])
         colours = np.where(is_person, NONE, self._colours[known])
         facing = np.full(len(flat), NONE)
         if is_person.any():
-            rows = people[who[is_person]]
+            rows = people[index[is_person]]
             bearings = np.arctan2(rows[:, 1] - view.eye[1], rows[:, 0] - view.eye[0])
             facing[is_person] = np.rint((rows[:, 2] - bearings) / (2 * pi / OCTANTS)).astype(np.int64) % OCTANTS
         ranges = self._ranges(flat, view, people)
@@ -147,11 +147,11 @@ class SceneLabels:
                 boxes = self._boxes[flat[group]]
                 along[group] = _met(boxes[:, -count:] if count else boxes, view.eye, rays[group])
         ranges = along * np.hypot(rays[:, 0], rays[:, 1])
-        who = flat - self.first_person
-        person = who >= 0
-        if person.any():
-            offsets = people[who[person], :2] - view.eye[:2]
-            ranges[person] = np.hypot(offsets[:, 0], offsets[:, 1]) - _PERSON_HALF_M
+        index = flat - self.first_person
+        is_person = index >= 0
+        if is_person.any():
+            offsets = people[index[is_person], :2] - view.eye[:2]
+            ranges[is_person] = np.hypot(offsets[:, 0], offsets[:, 1]) - _PERSON_HALF_M
         ranges[flat == SKY] = FAR_M
         clipped: Array = np.clip(ranges, NEAREST_M, FAR_M)
         return clipped

@@ -118,7 +118,7 @@ class Poses:
         return self._towards(x, y, thing.heading_rad + float(self._rng.normal(0.0, _FRONT_RAD)), gap)
 
     def _towards(self, x: float, y: float, side_rad: float, gap_m: float) -> Pose:
-        """Return a pose at distance `gap_m` on one side of a point that looks roughly at it."""
+        """Return a pose at distance `gap_m` on one side of a point that faces it roughly."""
         px, py = x + gap_m * cos(side_rad), y + gap_m * sin(side_rad)
         return (px, py, atan2(y - py, x - px) + float(self._rng.uniform(-_AIM_RAD, _AIM_RAD)))
 
@@ -142,7 +142,7 @@ def body_state(scene: Scene, robot: str, pose: Pose, rng: np.random.Generator) -
 
 
 def quaternion_xyzw(roll_rad: float, pitch_rad: float, yaw_rad: float) -> tuple[float, float, float, float]:
-    """Return the rotation about x, then y, then z of the world (positive pitch looks down)."""
+    """Return the rotation about x, then y, then z of the world (positive pitch points down)."""
     (cr, sr), (cp, sp), (cy, sy) = ((cos(a / 2), sin(a / 2)) for a in (roll_rad, pitch_rad, yaw_rad))
     return (
         sr * cp * cy - cr * sp * sy,

@@ -85,7 +85,7 @@ def run(job: StageJob) -> dict[str, Any]:
 
 def _encoded(job: StageJob, tokens: TokenCache, ids: Sequence[str]) -> TokenCache:
     if tokens.missing(ids):
-        job.progress.say("encoding frames")
+        job.progress.log("encoding frames")
     tokens.build(ids, device=job.device, ranks=job.ranks, progress=job.progress)
     return tokens
 
@@ -102,7 +102,7 @@ def _states(
 ) -> KvCache:
     """Build the semantic states of drives with the true text, or (`own`) with text that the language model decodes."""
     config = job.recipe.imitate.states
-    job.progress.say("semantic states")
+    job.progress.log("semantic states")
     return build_kv_cache(
         dataset.folder / folder,
         network,

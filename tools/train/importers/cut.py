@@ -72,22 +72,22 @@ def drives(recording: Recording, kind: str, robot: str) -> Iterator[Drive]:
     Raises TrainError for an unreadable image and for texts of an episode that does not exist.
     """
     parts = [(piece, k) for piece in pieces(recording) for k in range(0, len(piece.pose) - FRAMES + 1, FRAMES)]
-    if unknown := sorted(set(recording.words) - set(range(len(parts)))):
+    if unknown := sorted(set(recording.texts) - set(range(len(parts)))):
         raise TrainError(
             f"recording {recording.name}: texts for episode {unknown[0]}; expected a number below {len(parts)}"
         )
     for number, (piece, start) in enumerate(parts):
-        words = recording.words.get(number, Texts())
-        if words.traces and len(words.traces) != FRAMES // TRACE_EVERY:
+        texts = recording.texts.get(number, Texts())
+        if texts.traces and len(texts.traces) != FRAMES // TRACE_EVERY:
             raise TrainError(
                 f"recording {recording.name}: episode {number}: expected {FRAMES // TRACE_EVERY} traces, one a second, "
-                f"found {len(words.traces)}"
+                f"found {len(texts.traces)}"
             )
-        yield _drive(recording, kind, robot, number, piece, start, words)
+        yield _drive(recording, kind, robot, number, piece, start, texts)
 
 
 def _drive(
-    recording: Recording, kind: str, robot: str, number: int, piece: Piece, start: int, words: Texts
+    recording: Recording, kind: str, robot: str, number: int, piece: Piece, start: int, texts: Texts
 ) -> Drive:  # fmt: skip
     span = slice(start, start + FRAMES)
     last = len(piece.pose) - 1
@@ -118,9 +118,9 @@ def _drive(
         threshold_m=THRESHOLD_M,
         outcome="imported",
         collided=False,
-        wordings=words.wordings,
+        wordings=texts.wordings,
         told=(),
-        traces=tuple({"k": TRACE_EVERY * i, **trace} for i, trace in enumerate(words.traces)),
+        traces=tuple({"k": TRACE_EVERY * i, **trace} for i, trace in enumerate(texts.traces)),
     )
     return Drive(
         about=about,

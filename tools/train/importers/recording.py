@@ -8,7 +8,7 @@ GND (Liang et al. 2025), poses in its lidar map; only the position on the ground
 RECORDING/recording.json      {"frames": [{"stamp_s", "file"}], "poses": [{"stamp_s", "position_m", "quaternion_xyzw"}]}
 RECORDING/…                   the pictures that it names, JPEG or PNG, by paths below the recording's folder
 
-Both: RECORDING/texts.json, optional (`read_words`).
+Both: RECORDING/texts.json, optional (`read_texts`).
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ class Texts:
 class Recording:
     """A recording in order of time: `stamps_s` [p] and `pictures` [p]; `poses` [n, 4] (stamp s, x m, y m, theta rad).
 
-    `words`: texts by number of the 20 s episode.
+    `texts`: texts by number of the 20 s episode.
     """
 
     name: str
     stamps_s: NDArray[np.float64]
     pictures: tuple[Path, ...]
     poses: NDArray[np.float64]
-    words: Mapping[int, Texts]
+    texts: Mapping[int, Texts]
 
     def __post_init__(self) -> None:
         what = f"recording {self.name}"
@@ -96,7 +96,7 @@ def read_json(path: Path) -> Any:
         raise TrainError(f"{path}: not JSON ({error})") from error
 
 
-def read_words(folder: Path) -> dict[int, Texts]:
+def read_texts(folder: Path) -> dict[int, Texts]:
     """`texts.json` of a recording, if it has one: `{"0": {"wordings": [texts], "traces": [20 tables]}, …}` by episode.
 
     `traces` may be left out; a trace is {situation, objects, motion, progress {step, steps, passed}, plan}, each in the
@@ -153,7 +153,7 @@ def read_scand(folder: Path) -> Recording:
         stamps_s=np.array([(stamp_ns - first_ns) / 1e9 for stamp_ns, _ in pictures]),
         pictures=tuple(path for _, path in pictures),
         poses=np.array([((stamp_ns - first_ns) / 1e9, *pose) for stamp_ns, *pose in rows], np.float64),
-        words=read_words(folder),
+        texts=read_texts(folder),
     )
 
 
@@ -204,7 +204,7 @@ def read_gnd(folder: Path) -> Recording:
         stamps_s=np.array([stamp_s - first_s for stamp_s, _ in frames]),
         pictures=tuple(picture for _, picture in frames),
         poses=np.array([(stamp_s - first_s, *pose) for stamp_s, *pose in poses], np.float64),
-        words=read_words(folder),
+        texts=read_texts(folder),
     )
 
 

@@ -155,7 +155,7 @@ def _round(job: StageJob, step: Step) -> dict[str, Any]:
     if weights is None or weights.parent.name != "imitate":
         raise TrainError(f"{job.run_dir.out}: {step.name} needs a policy; run imitate first")
     folder = job.run_dir.stage(step.name)
-    artifacts = export_artifacts(weights, job.recipe.model, folder / "artifacts", job.progress.say)
+    artifacts = export_artifacts(weights, job.recipe.model, folder / "artifacts", job.progress.log)
     return run_round(job, artifacts, step.round)
 
 

@@ -38,7 +38,7 @@ def run(job: StageJob) -> dict[str, Any]:
     if weights is None or weights.parent.name not in ("imitate", "rl"):
         raise TrainError(f"{job.run_dir.out}: no policy to evaluate; run imitate first")
     folder = job.run_dir.stage(STAGE)
-    artifacts = export_artifacts(weights, job.recipe.model, folder / "artifacts", job.progress.say)
+    artifacts = export_artifacts(weights, job.recipe.model, folder / "artifacts", job.progress.log)
     suite = write_suite(folder, config)
     conditions = Conditions(
         PolicySpec("artifacts", str(artifacts.absolute())),

@@ -36,7 +36,7 @@ from export.model.heads import integrated
 from export.model.vision import VisionEncoder
 from sim_hil.benchmark.conditions.latency import Timing
 from sim_hil.benchmark.policies.artifacts_policy import CONTROL_PERIOD_NS, RING_S
-from sim_hil.benchmark.policies.lockstep_reasoner import VirtualTimeReasoner
+from sim_hil.benchmark.policies.virtual_time_reasoner import VirtualTimeReasoner
 from tools.train.config.checks import TrainError
 from tools.train.imitate.trainable_policies import PointGoalNet
 from tools.train.rl.rollout import PolicyOutput

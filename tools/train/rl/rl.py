@@ -193,7 +193,7 @@ def run(job: StageJob) -> dict[str, Any]:
         save_point_goal(net, folder / POINT_GOAL_FILE, f"edge-train {job.recipe.name}, seed {job.recipe.seed}, rl")
         return result
     check_tail(network.action)
-    artifacts = export_artifacts(before, job.recipe.model, folder / "artifacts", job.progress.say)
+    artifacts = export_artifacts(before, job.recipe.model, folder / "artifacts", job.progress.log)
     learner = TailLearner(network, limits, config.log_std, imitation=config.imitation)
     result = improve(job, learner, before, artifacts)
     finish_network(job, STAGE, network)
@@ -253,7 +253,7 @@ def _choose(job: StageJob, config: RlConfig, orders: _Orders, state: State, driv
     kept = "best" if scores["best"].ahead_of(scores["start"]) else "start"
     state.take(kept)
     before, after = scores["start"].success, scores["best"].success
-    job.progress.say(f"final scenarios: success {before:g} before, {after:g} after; kept policy: {kept}")
+    job.progress.log(f"final scenarios: success {before:g} before, {after:g} after; kept policy: {kept}")
     return {"kept": kept, "final": {name: asdict(score) for name, score in scores.items()}}
 
 

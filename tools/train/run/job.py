@@ -26,7 +26,7 @@ class StageProgress(Protocol):
     def update(self, done: int, total: int, **numbers: float) -> None:
         """Report `done` of `total` units of work, with values to show (loss, success …)."""
 
-    def say(self, line: str) -> None:
+    def log(self, line: str) -> None:
         """Show one line of text."""
 
 
@@ -36,7 +36,7 @@ class QuietProgress:
     def update(self, done: int, total: int, **numbers: float) -> None:
         """Nothing to do."""
 
-    def say(self, line: str) -> None:
+    def log(self, line: str) -> None:
         """Nothing to do."""
 
 
@@ -44,7 +44,7 @@ class QuietProgress:
 class StopFlag:
     """A flag that a signal handler sets: the running stage ends at its next step, with a checkpoint."""
 
-    asked: bool = False
+    requested: bool = False
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class StageJob:
 
         Every rank must call this function.
         """
-        return self.ranks.any(self.stop.asked)
+        return self.ranks.any(self.stop.requested)
 
 
 class StageDisplay(Progress):

@@ -164,7 +164,7 @@ def export_artifacts(
     weights: Path,
     config: TicVlaConfig,
     out: Path,
-    say: Callable[[str], None] = lambda line: None,
+    log: Callable[[str], None] = lambda line: None,
     command: Sequence[str] = COMMAND,
 ) -> Path:
     """Export into `out`, unless it contains these weights, and return it. Raises ExportError, KeyboardInterrupt."""
@@ -175,14 +175,14 @@ def export_artifacts(
         mark.unlink()
     out.parent.mkdir(parents=True, exist_ok=True)
     arguments = ["--target", TARGET, "--model", model_argument(config, out), "--checkpoint", str(weights)]
-    say(f"exporting the weights of stage {weights.parent.name}")
-    log = out.with_name(out.name + ".log")
-    with log.open("wb") as output:
+    log(f"exporting the weights of stage {weights.parent.name}")
+    log_path = out.with_name(out.name + ".log")
+    with log_path.open("wb") as output:
         code = subprocess.run([*command, *arguments, "--out", str(out)], stdout=output, stderr=output, check=False)
     if code.returncode == EXIT_INTERRUPTED:
         raise KeyboardInterrupt
     if code.returncode != EXIT_DONE:
-        lines = last_lines(log) or [f"see {log}"]
+        lines = last_lines(log_path) or [f"see {log_path}"]
         raise ExportError(f"{weights}: edge-export ended with {code.returncode}: {lines[-1]}")
     write_whole(mark, json.dumps({"weights_sha256": digest}) + "\n")
     return out

@@ -71,13 +71,13 @@ class RunDir:
 
     def _changed(self, recipe: Recipe) -> str:
         """Return the first value of a started stage that differs from the recipe's; empty if none does."""
-        found, asked = load_recipe(str(self.recipe_path)).to_tables(), recipe.to_tables()
+        found, expected = load_recipe(str(self.recipe_path)).to_tables(), recipe.to_tables()
         begun = [name for name in STAGES if self.begun(name)]
         fixed = [*begun, *(("seed", "name", "model") if begun else ())]
         if any(self.out.glob("dagger-*")):
             fixed.append("dagger")
         for section in fixed:
-            if difference := _difference(section, found.get(section), asked.get(section)):
+            if difference := _difference(section, found.get(section), expected.get(section)):
                 return difference
         return ""
 
@@ -90,14 +90,14 @@ class RunDir:
         """Link finished stages of another run. Raises TrainError if this recipe would give other results."""
         if not other.recipe_path.exists():
             raise TrainError(f"--from {other.out}: not a run folder of edge-train")
-        found, asked = load_recipe(str(other.recipe_path)).to_tables(), recipe.to_tables()
+        found, expected = load_recipe(str(other.recipe_path)).to_tables(), recipe.to_tables()
         for stage in stages:
             if other.result(stage) is None:
                 raise TrainError(f"--from {other.out}: stage {stage} has not finished")
-            if difference := _difference(stage, found[stage], asked[stage]):
+            if difference := _difference(stage, found[stage], expected[stage]):
                 raise TrainError(f"--from {other.out}: was trained with another recipe ({difference})")
         for part in SHARED_PARTS:
-            if difference := _difference(f"model.{part}", found["model"][part], asked["model"][part]):
+            if difference := _difference(f"model.{part}", found["model"][part], expected["model"][part]):
                 raise TrainError(f"--from {other.out}: its {part} differs ({difference})")
         for stage in stages:
             link = self.out / stage
@@ -172,13 +172,13 @@ class RunDir:
         write_whole(self.stage(stage) / "result.json", json.dumps(result, indent=1, sort_keys=True) + "\n")
 
 
-def _difference(where: str, found: object, asked: object) -> str:
+def _difference(where: str, found: object, expected: object) -> str:
     """Describe the first difference of two tables as `where.key: found A, recipe B`; empty if they are equal."""
-    if isinstance(found, Mapping) and isinstance(asked, Mapping):
-        keys = sorted({*found, *asked} - {"jobs"})  # the number of processes does not change the result
-        return next((d for key in keys if (d := _difference(f"{where}.{key}", found.get(key), asked.get(key)))), "")
-    same = json.dumps(found) == json.dumps(asked)
-    return "" if same else f"{where}: found {json.dumps(found)}, recipe {json.dumps(asked)}"
+    if isinstance(found, Mapping) and isinstance(expected, Mapping):
+        keys = sorted({*found, *expected} - {"jobs"})  # the number of processes does not change the result
+        return next((d for key in keys if (d := _difference(f"{where}.{key}", found.get(key), expected.get(key)))), "")
+    same = json.dumps(found) == json.dumps(expected)
+    return "" if same else f"{where}: found {json.dumps(found)}, recipe {json.dumps(expected)}"
 
 
 def versions() -> dict[str, Any]:

@@ -89,24 +89,26 @@ class Score:
         return {key: numbers[key] for key in ("answers", "waypoints_parsable", "waypoint_error_m")}
 
 
-def evaluate(speaker: Speaker, anchors: Sequence[Anchor], config: EvalConfig, *, seed: int) -> dict[str, Any]:
+def evaluate(decoder: GreedyDecoder, anchors: Sequence[Anchor], config: EvalConfig, *, seed: int) -> dict[str, Any]:
     """Return scores as `taught` (true previous progress), `own` (its own previous progress) and `waypoints_only`."""
     rng = np.random.default_rng((seed, _TAG))
     some = _some(anchors, config.anchors, rng)
     scores: dict[str, Any] = {
-        "taught": taught(speaker, some, config.gap_s).numbers(),
-        "waypoints_only": taught(speaker, some, config.gap_s, waypoints_only=True).points(),
+        "taught": taught(decoder, some, config.gap_s).numbers(),
+        "waypoints_only": taught(decoder, some, config.gap_s, waypoints_only=True).points(),
     }
     ids = sorted({anchor.drive_id for anchor in anchors})
     chosen = {ids[int(i)] for i in rng.permutation(len(ids))[: config.drives]}
-    scores["own"] = closed_loop(speaker, [each for each in anchors if each.drive_id in chosen], config.gap_s, rng)
+    scores["own"] = closed_loop(decoder, [each for each in anchors if each.drive_id in chosen], config.gap_s, rng)
     return scores
 
 
-def evaluate_epoch(speaker: Speaker, anchors: Sequence[Anchor], config: EvalConfig, *, seed: int) -> dict[str, float]:
+def evaluate_epoch(
+    decoder: GreedyDecoder, anchors: Sequence[Anchor], config: EvalConfig, *, seed: int
+) -> dict[str, float]:
     """Return a few scores of `epoch_anchors` fixed anchors for a curve; empty if there are none."""
     some = _some(anchors, config.epoch_anchors, np.random.default_rng((seed, _TAG)))
-    numbers = taught(speaker, some, config.gap_s).numbers()
+    numbers = taught(decoder, some, config.gap_s).numbers()
     found = {
         "parsable_share": numbers["waypoints_parsable"],
         "progress_share": numbers["progress_right"],
@@ -118,12 +120,12 @@ def evaluate_epoch(speaker: Speaker, anchors: Sequence[Anchor], config: EvalConf
 
 
 def taught(
-    speaker: Speaker, questions: Sequence[tuple[Anchor, str]], gap_s: float, *, waypoints_only: bool = False
+    decoder: GreedyDecoder, questions: Sequence[tuple[Anchor, str]], gap_s: float, *, waypoints_only: bool = False
 ) -> Score:
     """Score answers to (anchor, wording) with the true progress of `gap_s` ago in the prompt."""
     drawn = [(anchor, Drawn(wording, anchor.before(gap_s), waypoints_only)) for anchor, wording in questions]
     score = Score(gap_s)
-    for (anchor, _), text in zip(drawn, speaker.say(drawn), strict=True):
+    for (anchor, _), text in zip(drawn, decoder.generate(drawn), strict=True):
         score.add(text, anchor)
     return score
 
@@ -134,7 +136,7 @@ def _some(anchors: Sequence[Anchor], count: int, rng: np.random.Generator) -> li
     return [(anchor, anchor.wordings[int(rng.integers(len(anchor.wordings)))]) for anchor in chosen]
 
 
-class Speaker:
+class GreedyDecoder:
     """Greedy decoding of a language model, in batches of similar length."""
 
     def __init__(self, language: LanguageModel, prompts: Prompts, tokens: FrameTokens, config: EvalConfig) -> None:
@@ -144,7 +146,7 @@ class Speaker:
         """Return what the runner constrains an answer with."""
         return self._prompts.constraint(context)
 
-    def say(
+    def generate(
         self, questions: Sequence[tuple[Anchor, Drawn]], constraints: Sequence[TextConstraint | None] | None = None
     ) -> list[str]:
         """Return the text after each prompt, with the start that it was given; `constraints`: one a question."""
@@ -169,7 +171,9 @@ class Speaker:
         return texts
 
 
-def closed_loop(speaker: Speaker, anchors: Iterable[Anchor], gap_s: float, rng: np.random.Generator) -> dict[str, Any]:
+def closed_loop(
+    decoder: GreedyDecoder, anchors: Iterable[Anchor], gap_s: float, rng: np.random.Generator
+) -> dict[str, Any]:
     """Score along drives where `before` is the model's own last progress, as on the robot.
 
     The runner's rule for progress applies; its rules for the next turn, which need odometry, do not.
@@ -184,8 +188,8 @@ def closed_loop(speaker: Speaker, anchors: Iterable[Anchor], gap_s: float, rng: 
     for step in range(max((len(each) for each in drives.values()), default=0)):
         now = [each[step] for each in drives.values() if step < len(each)]
         drawn = [(anchor, Drawn(wording[anchor.drive_id], context[anchor.drive_id].before)) for anchor in now]
-        constraints = [speaker.constraint(context[anchor.drive_id]) for anchor in now]
-        for anchor, constraint, text in zip(now, constraints, speaker.say(drawn, constraints), strict=True):
+        constraints = [decoder.constraint(context[anchor.drive_id]) for anchor in now]
+        for anchor, constraint, text in zip(now, constraints, decoder.generate(drawn, constraints), strict=True):
             score.add(text, anchor)
             context[anchor.drive_id] = context[anchor.drive_id].after(text, constraint)
     return score.numbers()

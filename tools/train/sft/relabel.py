@@ -240,8 +240,8 @@ def relabel_along(
         means = [turning_first((float(plan[k, 0, 0]), float(plan[k, 0, 1])), driving.turn_radps, speed_mps)]
         alone = tracer.trace(drive.T_world_base(k), np.zeros((0, 2)), np.zeros((0, 2)), means)
         traces.append({"k": k, **aspects_json(_with_people(alone, aspects_of_json(own)))})
-    told = tuple(scenario.told_json())
-    return InstructionRelabel(scenario.wordings, told, scenario.episode.goal_xy, plan, tuple(traces))
+    steps = tuple(scenario.steps_json())
+    return InstructionRelabel(scenario.wordings, steps, scenario.episode.goal_xy, plan, tuple(traces))
 
 
 def _with_people(alone: ReasoningText, own: ReasoningText) -> ReasoningText:

@@ -35,7 +35,7 @@ from tools.train.samples.language_batch import Halves, LanguageBatch, Row, bucke
 from tools.train.samples.mirror import FOLDER as MIRRORED
 from tools.train.samples.mirror import Joined, SecondsDataset, Views, mirrored
 from tools.train.samples.tokens import TokenCache
-from tools.train.sft.language_eval import Speaker, evaluate, evaluate_epoch
+from tools.train.sft.language_eval import GreedyDecoder, evaluate, evaluate_epoch
 from tools.train.sft.relabel import InstructionRelabels
 
 STAGE: Final = "sft"
@@ -126,7 +126,7 @@ def run(job: StageJob) -> dict[str, Any]:
         mirror = TokenCache(SecondsDataset.of(dataset, mirrored=True), network.vision, dataset.folder / MIRRORED)
         _encode(job, mirror, dataset.train)
     job = replace(job, recipe=replace(job.recipe, sft=replace(config, epochs=epochs, optim=optim)))
-    more = _retold(job, dataset) if config.retold.ways else []
+    more = _relabelled(job, dataset) if config.retold.ways else []
     views = Views(plain, mirror)
     if config.tours.count:
         tours = _tours(job, dataset)
@@ -152,7 +152,7 @@ def _start(job: StageJob, config: SftConfig) -> tuple[TicVla, int, OptimConfig]:
 
 def _encode(job: StageJob, tokens: TokenCache, ids: Sequence[str]) -> None:
     if tokens.missing(ids):
-        job.progress.say("encoding frames")
+        job.progress.log("encoding frames")
     tokens.build(ids, device=job.device, ranks=job.ranks, progress=job.progress)
 
 
@@ -178,7 +178,7 @@ def fit(
     content = _content(job, dataset, tokenizer, network, more)
     loop = TrainingLoop(job, STAGE, {"language": language}, optimiser, content, config.checkpoint_steps)
     questions = _held(held, config, job.seed)
-    speaker = Speaker(language, prompts, views.plain, config.evaluate)
+    decoder = GreedyDecoder(language, prompts, views.plain, config.evaluate)
 
     def losses(samples: Sequence[Sample]) -> torch.Tensor:
         batch = _batch(job, network, data, samples)
@@ -190,7 +190,7 @@ def fit(
             return {}
         found = {"held_loss": mean_loss(job, network, held, questions)} if questions else {}
         if job.ranks.first:
-            found |= evaluate_epoch(speaker, held.anchors, config.evaluate, seed=job.seed)
+            found |= evaluate_epoch(decoder, held.anchors, config.evaluate, seed=job.seed)
         return found
 
     numbers = loop.run(_shares(job, data, optimiser.step_count, per_epoch), losses, scores)
@@ -202,7 +202,7 @@ def fit(
         **numbers,
     }
     if job.ranks.first and held.anchors:
-        result["held_out"] = evaluate(speaker, held.anchors, config.evaluate, seed=job.seed)
+        result["held_out"] = evaluate(decoder, held.anchors, config.evaluate, seed=job.seed)
     return result
 
 
@@ -250,10 +250,10 @@ def _anchors(dataset: Dataset, ids: Sequence[str]) -> Iterator[Anchor]:
 def _tours(job: StageJob, dataset: Dataset) -> Dataset:
     """Return the tours to train on; missing ones are recorded."""
     config, rounds = job.recipe.sft, job.run_dir.retired(STAGE)
-    job.progress.say("recording tours")
+    job.progress.log("recording tours")
     tours = build_tours(
         dataset, config.tours, job.recipe.collect, job.recipe.seed, ranks=job.ranks, progress=job.progress,
-        stopped=lambda: job.stop.asked,
+        stopped=lambda: job.stop.requested,
     )  # fmt: skip
     if not rounds or not config.go_on_share:
         return tours
@@ -274,12 +274,12 @@ def _with_tours(job: StageJob, network: TicVla, views: Views, tours: Dataset) ->
     return Views(views.plain, mirror, seconds)
 
 
-def _retold(job: StageJob, dataset: Dataset) -> list[Anchor]:
+def _relabelled(job: StageJob, dataset: Dataset) -> list[Anchor]:
     """Return the anchors of relabelled training drives; missing relabels are computed."""
     recipe = job.recipe
     relabels = InstructionRelabels(dataset, recipe.sft.retold, recipe.seed, recipe.collect.speed_mps)
-    job.progress.say("relabelling drives")
-    relabels.build(dataset.train, ranks=job.ranks, progress=job.progress, stopped=lambda: job.stop.asked)
+    job.progress.log("relabelling drives")
+    relabels.build(dataset.train, ranks=job.ranks, progress=job.progress, stopped=lambda: job.stop.requested)
     return [anchor for drive in dataset.drives(dataset.train, pictures=False) for anchor in relabels.anchors(drive)]
 
 

@@ -58,7 +58,7 @@ def comb() -> Scene:
 def way() -> RouteDescription:
     scene = comb()
     machine = next(thing for thing in scene.objects if thing.label == "machine")
-    return make_task(scene, NavGrid(scene, clearance_m=0.4), (1.0, 1.2, 0.0), machine).told
+    return make_task(scene, NavGrid(scene, clearance_m=0.4), (1.0, 1.2, 0.0), machine).route
 
 
 def test_a_way_is_told_by_its_turn_its_count_and_what_it_passes(way: RouteDescription) -> None:
@@ -72,8 +72,8 @@ def test_a_way_is_told_by_its_turn_its_count_and_what_it_passes(way: RouteDescri
 def test_doors_are_counted_apart_from_corridors() -> None:
     scene = comb()
     shelf = next(thing for thing in scene.objects if thing.label == "shelf")
-    told = make_task(scene, NavGrid(scene, clearance_m=0.4), (1.0, 1.2, 0.0), shelf).told
-    (step,) = told.steps
+    route = make_task(scene, NavGrid(scene, clearance_m=0.4), (1.0, 1.2, 0.0), shelf).route
+    (step,) = route.steps
     assert (step.side, step.kind, step.ordinal) == ("right", "room", 1)
 
 
@@ -82,8 +82,8 @@ def test_a_turn_where_the_corridor_ends_is_told_as_such() -> None:
     moved = [replace(thing, position_m=(17.0, 7.4, 0.0)) if thing.label == "machine" else thing
              for thing in scene.objects]  # fmt: skip
     scene = replace(scene, objects=tuple(moved))
-    told = make_task(scene, NavGrid(scene, clearance_m=0.4), (1.0, 1.2, 0.0), moved[0]).told
-    assert (told.steps[0].ordinal, told.steps[0].at_end) == (3, True)
+    route = make_task(scene, NavGrid(scene, clearance_m=0.4), (1.0, 1.2, 0.0), moved[0]).route
+    assert (route.steps[0].ordinal, route.steps[0].at_end) == (3, True)
 
 
 def test_a_start_right_beside_an_opening_that_counts_is_refused() -> None:
@@ -120,7 +120,7 @@ def tee(door_x: float) -> Scene:
 def told_in_tee(door_x: float, goal: str) -> RouteDescription:
     scene = tee(door_x)
     thing = next(thing for thing in scene.objects if thing.label == goal)
-    return make_task(scene, NavGrid(scene, clearance_m=0.4), (5.0, 1.0, pi / 2), thing).told
+    return make_task(scene, NavGrid(scene, clearance_m=0.4), (5.0, 1.0, pi / 2), thing).route
 
 
 def test_a_door_straight_across_from_where_one_comes_out_is_counted_by_some_and_refused() -> None:
@@ -160,17 +160,17 @@ def test_true_words_are_accepted(text: str, way: RouteDescription) -> None:
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("Take the second right and stop at the vending machine.", "says right, it is left"),
-        ("Take the first left and stop at the vending machine.", "says number 1"),
-        ("Take the second door on the left and stop at the vending machine.", "says room"),
-        ("Turn left and stop at the vending machine.", "does not say which"),
-        ("At the end of the corridor turn left, stop at the vending machine.", "not"),
+        ("Take the second right and stop at the vending machine.", "expected left, found right"),
+        ("Take the first left and stop at the vending machine.", "expected number 2, found 1"),
+        ("Take the second door on the left and stop at the vending machine.", "found room"),
+        ("Turn left and stop at the vending machine.", "is ambiguous"),
+        ("At the end of the corridor turn left, stop at the vending machine.", "is not at the end"),
         ("Take the second left, then turn left, stop at the vending machine.", "one turn too many"),
         ("Stop at the vending machine.", "leaves out"),
         ("Take the second left.", "names no goal"),
-        ("Take the second left and stop at the bookshelf.", "speaks of the bookshelf"),
+        ("Take the second left and stop at the bookshelf.", "found bookshelf"),
         ("Pass the potted plant on your left, take the second left, stop at the vending machine.", "on the right"),
-        ("Take the second left and stop at the vending machine on your right.", "says that the goal is on the right"),
+        ("Take the second left and stop at the vending machine on your right.", "side of the goal: expected"),
         ("Leave the room, take the second left, stop at the vending machine.", "start is in none"),
         ("Take the second left, mind the third step, stop at the vending machine.", "cannot be read"),
     ],
@@ -238,8 +238,8 @@ def drawn(request: pytest.FixtureRequest) -> list[Task]:
 def test_training_scenes_yield_tasks_whose_wordings_are_true(drawn: list[Task]) -> None:
     assert len(drawn) == 3
     for index, task in enumerate(drawn):
-        for text in wordings(task.told, 6, index, held_out=False):
-            assert untrue(text, task.told) == [], text
+        for text in wordings(task.route, 6, index, held_out=False):
+            assert untrue(text, task.route) == [], text
 
 
 @pytest.mark.slow

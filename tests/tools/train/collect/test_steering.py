@@ -109,7 +109,7 @@ def test_it_is_to_somewhere_that_the_robot_fits_and_is_begun_before_the_ways_end
         grid = scenario.site.robot_grid(scenario.episode.robot)
         for detour in detours(scenario, 4):
             assert detour is not None and grid.is_free(*detour.to)
-            assert 0.0 <= detour.after_m <= scenario.told.length_m + 0.5 and detour.for_m >= 1.0
+            assert 0.0 <= detour.after_m <= scenario.route.length_m + 0.5 and detour.for_m >= 1.0
 
 
 @pytest.mark.slow
@@ -128,18 +128,18 @@ def test_a_wrong_opening_leads_into_an_area_near_a_step_that_is_not_the_one_to_b
         for detour in mistakes(scenario):
             found += 1
             beside = []
-            for step in scenario.told.steps:
+            for step in scenario.route.steps:
                 frame = Frame(step.ahead)
                 ahead_m = frame.along(detour.to) - frame.along(step.at)
                 side = "left" if frame.across(detour.to) > frame.across(step.at) else "right"
                 beside.append(side != step.side or abs(ahead_m) > 0.5)
                 near = hypot(detour.to[0] - step.at[0], detour.to[1] - step.at[1]) < 20.0
-                assert near or len(scenario.told.steps) > 1
+                assert near or len(scenario.route.steps) > 1
             assert any(beside) and any(area.contains(*detour.to) for area in scenario.scene.areas)
     assert found
 
 
 @pytest.mark.slow
 def test_where_nothing_is_to_be_taken_there_is_no_wrong_opening() -> None:
-    plain = [scenario for scenario in all_scenarios() if not scenario.told.steps]
+    plain = [scenario for scenario in all_scenarios() if not scenario.route.steps]
     assert plain and not any(mistakes(scenario) for scenario in plain)

@@ -48,7 +48,7 @@ def _said(progress: RouteProgress, points: Points) -> list[Progress]:
 def test_whoever_takes_the_kth_opening_has_passed_k_less_one(kind: str, way) -> None:  # type: ignore[no-untyped-def]
     for scenario in scenarios(kind):
         said = _said(progress_of(scenario), way(scenario))
-        for index, step in enumerate(scenario.told.steps):
+        for index, step in enumerate(scenario.route.steps):
             before = [progress for progress in said if progress.step == index + 1]
             assert before, f"{scenario.episode.id}: step {index + 1} is never next"
             assert before[-1].passed == max(0, step.ordinal - 1), scenario.episode.id
@@ -64,7 +64,7 @@ def test_progress_never_falls_back_along_the_way(way) -> None:  # type: ignore[n
 
 def test_it_begins_with_the_first_turn_and_ends_on_the_last_leg() -> None:
     for scenario in all_scenarios():
-        progress, steps = progress_of(scenario), len(scenario.told.steps)
+        progress, steps = progress_of(scenario), len(scenario.route.steps)
         assert progress.at(SE2(*scenario.task.start)) == Progress(1, steps, 0)
         assert progress.at(SE2(*scenario.task.goal, 0.0)) == Progress(steps + 1, steps, 0)
 
@@ -73,7 +73,7 @@ def test_whoever_drives_past_the_turn_is_still_before_it_and_has_passed_it() -> 
     checked = 0
     for scenario in all_scenarios():
         progress, way = progress_of(scenario), _told_way(scenario)
-        for index, step in enumerate(scenario.told.steps):
+        for index, step in enumerate(scenario.route.steps):
             if not step.counted or step.before_kind not in ("corridor", "aisle"):
                 continue
             frame, taken = Frame(step.ahead), step.counted[step.ordinal - 1]
@@ -82,7 +82,7 @@ def test_whoever_drives_past_the_turn_is_still_before_it_and_has_passed_it() -> 
             said = progress.at(SE2(x, y, 0.0))
             if scenario.site.grid.clearance_m(x, y) < 0.2 or progress.strayed_m(SE2(x, y, 0.0)) > 4.0:
                 continue  # a wall is there
-            assert (said.step, said.steps) == (index + 1, len(scenario.told.steps)), scenario.episode.id
+            assert (said.step, said.steps) == (index + 1, len(scenario.route.steps)), scenario.episode.id
             assert said.passed >= step.ordinal, scenario.episode.id
             checked += 1
     assert checked >= 2
@@ -91,14 +91,14 @@ def test_whoever_drives_past_the_turn_is_still_before_it_and_has_passed_it() -> 
 def test_a_pose_off_the_floor_belongs_somewhere_too() -> None:
     for scenario in all_scenarios():
         for xy in ((1e3, 1e3), (-1e3, 0.0)):
-            assert progress_of(scenario).at(SE2(*xy, 0.0)).steps == len(scenario.told.steps)
+            assert progress_of(scenario).at(SE2(*xy, 0.0)).steps == len(scenario.route.steps)
 
 
 def test_the_way_left_shrinks_metre_by_metre() -> None:
     for scenario in all_scenarios():
         progress, points = progress_of(scenario), _told_way(scenario)
         left = [progress.left_m(SE2(x, y, 0.0)) for x, y in points]
-        assert left[0] == pytest.approx(scenario.told.length_m, abs=0.6)
+        assert left[0] == pytest.approx(scenario.route.length_m, abs=0.6)
         assert left[-1] == pytest.approx(0.0, abs=0.3)
         assert all(b <= a + 0.15 for a, b in itertools.pairwise(left))
 

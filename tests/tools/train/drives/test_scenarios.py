@@ -90,7 +90,7 @@ def test_a_scenario_with_a_wording_or_a_crowd_of_the_benchmark_is_refused() -> N
 def test_every_scenario_has_wordings_enough_and_all_of_them_true() -> None:
     for scenario in all_scenarios():
         assert len(set(scenario.wordings)) >= LEAST_WORDINGS
-        assert not [problem for text in scenario.wordings for problem in untrue(text, scenario.told)]
+        assert not [problem for text in scenario.wordings for problem in untrue(text, scenario.route)]
 
 
 def test_a_task_can_be_done_by_its_robot_and_ends_before_its_landmark() -> None:

@@ -122,7 +122,7 @@ def test_a_header_that_does_not_match_the_grammar_is_refused(wrong: dict[str, st
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_plan_is_the_next_told_step_or_to_stop(kind: str) -> None:
     for scenario in scenarios(kind):
-        tracer, steps = _tracer(scenario), scenario.told.steps
+        tracer, steps = _tracer(scenario), scenario.route.steps
         for pose in _poses(scenario, 5.0):
             trace = tracer.trace(pose, *NOBODY, AHEAD)
             assert trace.progress is not None and trace.plan is not None
@@ -153,7 +153,7 @@ def test_an_opening_that_counts_is_named_on_its_side_before_one_is_there() -> No
     checked = 0
     for scenario in all_scenarios():
         tracer, poses = _tracer(scenario), _poses(scenario, 0.1)
-        for step in scenario.told.steps:
+        for step in scenario.route.steps:
             if step.kind not in ("room", "corridor", "aisle") or step.before_kind not in ("corridor", "aisle"):
                 continue
             if not step.counted or step.before_m < 4.0:
@@ -276,8 +276,8 @@ def _without(scene: Scene, label: str) -> CameraWorld:
 @pytest.mark.slow
 def test_the_goal_is_spoken_of_just_when_the_picture_shows_it(office: tuple[Scenario, CameraWorld]) -> None:
     scenario, world = office
-    tracer, told = _tracer(scenario), scenario.told
-    thing = next(thing for thing in scenario.scene.objects if thing.label == told.goal_label)
+    tracer, route = _tracer(scenario), scenario.route
+    thing = next(thing for thing in scenario.scene.objects if thing.label == route.goal_label)
     bare = _without(scenario.scene, thing.label)
     try:
         nobody = np.array(((-500.0, -500.0, 0.0),))

@@ -20,7 +20,7 @@ from edge.state.semantic import SemanticSlot, SharedState
 from export.model.config import PRESETS
 from export.model.tokenizers.nano import NANO_TOKENIZER
 from sim_hil.benchmark.conditions.latency import Timing
-from sim_hil.benchmark.policies.lockstep_reasoner import VirtualTimeReasoner
+from sim_hil.benchmark.policies.virtual_time_reasoner import VirtualTimeReasoner
 from tests.support.train.train_drives import WORDINGS, made_up_drive, progress_at, trace_at
 from tools.train.config.sft import DrawConfig
 from tools.train.drives.trace_sentences import aspects_of_json

@@ -68,7 +68,7 @@ class Parrot:
         self.guided.append((known.before, known.follow))
         return SimpleNamespace(refused=BACK if len(self.guided) == 1 else None)
 
-    def say(self, questions: Sequence[tuple[Anchor, Drawn]], constraints: Sequence[object]) -> list[str]:
+    def generate(self, questions: Sequence[tuple[Anchor, Drawn]], constraints: Sequence[object]) -> list[str]:
         assert len(constraints) == len(questions)
         self.told += [(anchor.drive_id, anchor.k, drawn.before) for anchor, drawn in questions]
         assert all(drawn.wording in WORDINGS and not drawn.waypoints_only for _, drawn in questions)

@@ -83,7 +83,7 @@ def test_no_wording_is_untrue_or_the_benchmarks(kind: str) -> None:
     _, _, found = _told(kind)
     for each in found:
         assert not any(is_held_out(text) for text in each.wordings)
-        assert not any(untrue(text, _tasks(kind)[each.goal_xy].told) for text in each.wordings)
+        assert not any(untrue(text, _tasks(kind)[each.goal_xy].route) for text in each.wordings)
 
 
 @pytest.mark.slow

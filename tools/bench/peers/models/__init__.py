@@ -1,1 +1,1 @@
-"""The shared weights in every peer's own format."""
+"""Converts the shared weights to every peer's format."""

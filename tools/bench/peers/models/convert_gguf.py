@@ -1,4 +1,4 @@
-"""llama.cpp's file of the language model: Qwen2 tensors in Q4_0 or Q8_0, no vocabulary (ids are given)."""
+"""Writes the language model for llama.cpp: Qwen2 tensors in Q4_0 or Q8_0, without vocabulary (inputs are ids)."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ TYPES = {"q4_0": gguf.GGMLQuantizationType.Q4_0, "q8_0": gguf.GGMLQuantizationTy
 FILE_TYPES = {"q4_0": gguf.LlamaFileType.MOSTLY_Q4_0, "q8_0": gguf.LlamaFileType.MOSTLY_Q8_0}
 SLAB_ROWS = 8192
 BLOCK = 32
-"""Columns that share a scale; a matrix that does not divide stays in fp16 (none does at full size)."""
+"""Columns per scale; a matrix whose width is no multiple stays in fp16 (none at full size)."""
 
 
 def gguf_name(name: str) -> str:
-    """Name of a Qwen2 tensor in llama.cpp."""
+    """Return llama.cpp's name of a Qwen2 tensor."""
     parts = name.split(".")
     if parts[1] == "layers":
         return f"blk.{parts[2]}.{NAMES['.'.join(parts[3:-1])]}.{parts[-1]}"
@@ -67,7 +67,7 @@ def write_gguf(workload: Workload, reference: Path, folder: Path, kind: str) -> 
             if tensor.shape[1] % BLOCK:
                 writer.add_tensor(gguf_name(name), tensor.astype(np.float16))
                 continue
-            # In slabs of rows: the quantiser holds several copies of what it works on.
+            # In slabs of rows, because the quantiser makes several copies.
             slabs = [quantize(tensor[i : i + SLAB_ROWS], TYPES[kind]) for i in range(0, len(tensor), SLAB_ROWS)]
             writer.add_tensor(gguf_name(name), np.concatenate(slabs), raw_dtype=TYPES[kind])
     writer.write_header_to_file()

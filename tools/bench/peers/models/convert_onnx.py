@@ -1,4 +1,4 @@
-"""ONNX forms of the peers of our own stack: the unsplit action expert, and ONNX Runtime GenAI's own builder."""
+"""Writes the ONNX peers: the unsplit action expert, and ONNX Runtime GenAI's model by its own builder."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def write_action(workload: Workload, reference: Path, folder: Path, kind: str) -
         dynamo=True,
     )
     if kind == "int8":
-        # The exporter's notes on inner shapes contradict its transposed weights, and the quantiser believes them.
+        # The exporter's inner shapes contradict its transposed weights and mislead the quantiser.
         model = onnx.load(plain)
         del model.graph.value_info[:]
         onnx.save(model, plain)

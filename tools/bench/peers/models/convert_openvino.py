@@ -1,4 +1,4 @@
-"""OpenVINO's models: encoder and action expert (fp32, NNCF int8), stateful decoder (NNCF int8 and int4 weights)."""
+"""Writes OpenVINO's models: encoder, action expert (fp32, NNCF int8), stateful decoder (int8, int4 weights)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CALIBRATION_FRAMES = 4
 
 
 class QwenLayer(nn.Module):
-    """A Qwen2 layer written the way OpenVINO's fusions (rotary embedding, stateful attention) look for."""
+    """Qwen2 layer in the form that OpenVINO's fusions (rotary embedding, stateful attention) recognise."""
 
     def __init__(self, c: LanguageConfig) -> None:
         super().__init__()
@@ -44,7 +44,7 @@ class QwenLayer(nn.Module):
         return weight * (x * torch.rsqrt(x.pow(2).mean(-1, keepdim=True) + self.c.rms_eps))
 
     def _rotate(self, x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
-        # This way of writing it is the one that the plugin's RoPE fusion recognises (seen in its runtime graph).
+        # The plugin's RoPE fusion recognises this form (checked in its runtime graph).
         half = self.c.head_dim // 2
         first, second = torch.split(x, [half, half], dim=-1)
         c, s = cos[..., :half], sin[..., :half]
@@ -60,7 +60,7 @@ class QwenLayer(nn.Module):
     def forward(
         self, x: Tensor, cos: Tensor, sin: Tensor, mask: Tensor, past_k: Tensor, past_v: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Hidden states and the grown keys and values."""
+        """Compute hidden states and the extended keys and values."""
         c = self.c
         n, t = x.shape[0], x.shape[1]
         h = self._norm(x, self.input_norm)
@@ -92,7 +92,7 @@ class Qwen(nn.Module):
     def forward(
         self, input_ids: Tensor, attention_mask: Tensor, position_ids: Tensor, beam_idx: Tensor, past: list[Tensor]
     ) -> tuple[Tensor, ...]:
-        """Logits [n, 1, vocab] and the grown caches."""
+        """Compute logits [n, 1, vocab] and the extended caches."""
         x = self.embed(input_ids)
         angle = (self.inv_freq @ position_ids[:, None, :].float()).transpose(1, 2)
         angle = torch.cat([angle, angle], dim=-1)
@@ -110,13 +110,13 @@ class Qwen(nn.Module):
 
 
 def language_model(workload: Workload, reference: Path) -> ov.Model:
-    """The stateful decoder in fp32."""
+    """Convert the stateful decoder in fp32."""
     c = workload.config.language
     with torch.device("meta"):
         model = Qwen(c)
     with safe_open(str(reference / "language" / "model.safetensors"), framework="pt") as file:
         tensors = {}
-        for name in model.state_dict():  # a norm's parameter has no module of its own here
+        for name in model.state_dict():  # a norm's parameter belongs to no module here
             whole = name if name.endswith((".weight", ".bias")) else f"{name}.weight"
             tensors[name] = file.get_tensor(qwen_name(whole))
     model.load_state_dict(tensors, assign=True)
@@ -150,7 +150,7 @@ def language_model(workload: Workload, reference: Path) -> ov.Model:
 
 
 def _reset_caches_to_batch(model: ov.Model, c: LanguageConfig) -> None:
-    """A cache starts empty at the batch size of the ids, which the fused attention requires."""
+    """Initialise the caches empty with the batch size of the ids, as the fused attention requires."""
     from openvino import opset13 as ops
 
     ids = model.input("input_ids")
@@ -178,7 +178,7 @@ def write_language(workload: Workload, reference: Path, folder: Path, kind: str)
 
 
 def _add_genai_files(source: Path, folder: Path) -> None:
-    """OpenVINO GenAI opens a folder that also has the tokenizer as models and the checkpoint's configuration."""
+    """Add the tokenizer's models and the checkpoint's configuration, which OpenVINO GenAI requires."""
     tokenizer = AutoTokenizer.from_pretrained(source)
     models = convert_tokenizer(tokenizer, with_detokenizer=True)
     for name, model in zip(("openvino_tokenizer", "openvino_detokenizer"), models, strict=True):

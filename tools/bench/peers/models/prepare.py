@@ -1,6 +1,6 @@
-"""Everything that a contender opens, made once and stamped: run as a module by the Python of the peers' environment.
+"""Builds the contenders' models once: run as a module by the Python of the peers' environment.
 
-A stamp is written last and names the recipe and the versions it was made with; what has its stamp is not made again.
+A stamp with recipe and versions is written last; a folder with a valid stamp is not built again.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 RECIPE = 1
-"""Raised whenever what a converter writes changes."""
+"""Version of the converters' output; increase it with every change."""
 
 
 _OPENVINO = ("openvino", "nncf")
@@ -39,12 +39,12 @@ ASSETS = {
 
 
 def stamp(packages: tuple[str, ...]) -> dict[str, Any]:
-    """What a finished folder was made with."""
+    """Return the stamp of a finished folder."""
     return {"recipe": RECIPE, "versions": {name: importlib.metadata.version(name) for name in packages}}
 
 
 def make(folder: Path, content: dict[str, Any], fill: Callable[[Path], None]) -> bool:
-    """Fill a folder unless its stamp has this content; returns whether there was work to do."""
+    """Fill a folder unless its stamp has this content; returns whether it was filled."""
     seal = folder / "stamp.json"
     if seal.is_file() and json.loads(seal.read_text(encoding="utf-8")) == content:
         return False
@@ -59,7 +59,7 @@ def make(folder: Path, content: dict[str, Any], fill: Callable[[Path], None]) ->
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command; returns its exit code."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument("--model", required=True)
     p.add_argument("--cache", type=Path, required=True, metavar="DIR")

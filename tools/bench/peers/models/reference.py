@@ -1,4 +1,4 @@
-"""The weights that all contenders share: our network, seed 0, its language model as a Hugging Face directory.
+"""Writes the shared weights of all contenders: our network, seed 0, its language model as a Hugging Face directory.
 
 The peers run encoder and action expert as PyTorch modules, the latter in one piece.
 """
@@ -33,7 +33,7 @@ LAYER_NAMES = {
 
 
 def qwen_name(name: str) -> str:
-    """Name of one of our language model's tensors in a Qwen2 checkpoint."""
+    """Return the Qwen2 checkpoint's name of a tensor of the language model."""
     head, *rest = name.split(".")
     if head == "layers":
         number, layer, kind = rest
@@ -42,7 +42,7 @@ def qwen_name(name: str) -> str:
 
 
 def qwen_config(c: LanguageConfig, dtype: str) -> dict[str, object]:
-    """`config.json` of the Qwen2 checkpoint."""
+    """Return `config.json` of the Qwen2 checkpoint."""
     return {
         "architectures": ["Qwen2ForCausalLM"],
         "model_type": "qwen2",
@@ -67,8 +67,11 @@ def qwen_config(c: LanguageConfig, dtype: str) -> dict[str, object]:
 
 
 def write_hugging_face(folder: Path, config: LanguageConfig, tensors: dict[str, Tensor], dtype: str) -> None:
-    """Write a Qwen2 directory; its tokenizer only names ids, since every contender is given ids."""
-    from tokenizers import Tokenizer, models  # here: a worker that imports this module is measured
+    """Write a Qwen2 directory; its tokenizer only names ids, because every contender reads ids."""
+    from tokenizers import (
+        Tokenizer,
+        models,
+    )  # imported here, because the memory of a worker that imports this module is measured
 
     folder.mkdir(parents=True, exist_ok=True)
     kind = {"float32": torch.float32, "bfloat16": torch.bfloat16}[dtype]
@@ -98,28 +101,28 @@ def write_reference(workload: Workload, folder: Path) -> None:
 
 
 class UnsplitAction(nn.Module):
-    """Context projection and step in one forward, as every peer would run the action expert."""
+    """Action expert with context projection and step in one forward pass, as the peers run it."""
 
     def __init__(self, expert: ActionExpert) -> None:
         super().__init__()
         self.expert = expert
 
     def forward(self, visual_tokens: Tensor, state: Tensor, latency: Tensor, last_layer_kv: Tensor) -> Tensor:
-        """Trajectory [1, steps, 3] from visual tokens, state, latency and the semantic state [1, T, kv_dim]."""
+        """Plan a trajectory [1, steps, 3] from visual tokens, state, latency and the semantic state [1, T, kv_dim]."""
         keys, values = self.expert.context(last_layer_kv)
         trajectory: Tensor = self.expert(visual_tokens, state, latency, keys, values)
         return trajectory
 
 
 class FixedEncoder(nn.Module):
-    """The encoder with its grid as a number: a tracer cannot take the root of a traced count of tokens."""
+    """Encoder with a constant grid size: a tracer cannot compute the root of a traced token count."""
 
     def __init__(self, encoder: VisionEncoder) -> None:
         super().__init__()
         self.encoder = encoder
 
     def forward(self, frame: Tensor) -> Tensor:
-        """Visual tokens [1, N, D] of a frame [1, px, px, 3]."""
+        """Encode a frame [1, px, px, 3] to visual tokens [1, N, D]."""
         e, c = self.encoder, self.encoder.config
         pixels = ((frame.float() - e.mean) * e.inv_std).to(e.cls.dtype)
         x = e.embed(pixels.permute(0, 3, 1, 2)).flatten(2).transpose(1, 2)
@@ -139,8 +142,8 @@ def _filled(module: nn.Module, path: Path) -> None:
 
 
 def load_vision(config: TicVlaConfig, reference: Path) -> FixedEncoder:
-    """The encoder with the reference's weights."""
-    # On "meta" nothing is allocated: a peer's peak memory must not hold weights that are replaced at once.
+    """Load the encoder with the reference's weights."""
+    # "meta" allocates nothing: weights that are replaced at once must not count in a peer's peak memory.
     with torch.device("meta"):
         encoder = VisionEncoder(config.vision)
     encoder.mean = torch.tensor(config.vision.mean) * 255
@@ -150,7 +153,7 @@ def load_vision(config: TicVlaConfig, reference: Path) -> FixedEncoder:
 
 
 def load_action(config: TicVlaConfig, reference: Path) -> UnsplitAction:
-    """The unsplit action expert with the reference's weights."""
+    """Load the unsplit action expert with the reference's weights."""
     with torch.device("meta"):
         expert = ActionExpert(config)
     _filled(expert, reference / "action.safetensors")

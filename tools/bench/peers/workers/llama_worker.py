@@ -60,9 +60,9 @@ class Decoder:
 
 
 def load(request: Load) -> Mapping[str, Task]:
-    """Open the language model: llama.cpp has no part in the others."""
+    """Open the language model; llama.cpp does not run the other parts."""
     if request.parts != ("language",):
-        raise ValueError(f"llama.cpp runs the language model only, asked for {list(request.parts)}")
+        raise ValueError(f"llama.cpp runs the language model only, found {list(request.parts)}")
     workload = Workload(request.model)
     llama.llama_backend_init()
     decoder = Decoder(request, workload)

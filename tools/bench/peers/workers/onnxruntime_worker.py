@@ -1,6 +1,6 @@
-"""ONNX Runtime as any user would call it: the unsplit action expert, and the decoder of GenAI's own builder.
+"""Worker of ONNX Runtime with its usual API: the unsplit action expert, and the decoder of GenAI's builder.
 
-Each is imported where it is used: a worker's memory is measured.
+Packages are imported where they are used, because the worker's memory is measured.
 """
 
 from __future__ import annotations

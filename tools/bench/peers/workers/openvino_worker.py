@@ -1,4 +1,4 @@
-"""OpenVINO: encoder, unsplit action expert and stateful decoder, or that decoder in OpenVINO GenAI's own pipeline.
+"""Worker of OpenVINO: encoder, unsplit action expert and stateful decoder, or the decoder in GenAI's pipeline.
 
 Options are passed on as plugin properties. `python -m … openvino_genai`: the pipeline.
 """
@@ -49,14 +49,14 @@ class Decoder:
 
 
 def compiled(core: ov.Core, request: Load, part: str) -> ov.CompiledModel:
-    """A part's model in the form and with the precision hint that the options name."""
+    """Compile a part's model in the form and with the precision hint of the options."""
     options = request.of(part)
     del options["form"]
     properties = {
         "INFERENCE_NUM_THREADS": request.threads,
         "NUM_STREAMS": 1,
         "PERFORMANCE_HINT": "LATENCY",
-        # The harness pins the process; the plugin's own pinning would count cores that it may not use.
+        # The harness pins the process; the plugin's pinning would include cores that it must not use.
         "ENABLE_CPU_PINNING": False,
         **options,
     }
@@ -65,7 +65,7 @@ def compiled(core: ov.Core, request: Load, part: str) -> ov.CompiledModel:
 
 
 def load(request: Load) -> Mapping[str, Task]:
-    """Open the parts asked for."""
+    """Open the requested parts."""
     workload, core = Workload(request.model), ov.Core()
     tasks: dict[str, Task] = {}
     if "encoder" in request.parts:
@@ -93,14 +93,14 @@ def load(request: Load) -> Mapping[str, Task]:
 
 
 def load_genai(request: Load) -> Mapping[str, Task]:
-    """Open the language model; times are GenAI's own: to the first token, and the mean of those after it."""
-    import openvino_genai as genai  # here: a worker's memory is measured
+    """Open the language model; GenAI measures the times: to the first token, and the mean of the later ones."""
+    import openvino_genai as genai  # imported here, because the worker's memory is measured
 
     workload = Workload(request.model)
     options: dict[str, Any] = request.of("language")
     del options["form"]
     scheduler = options["scheduler_config"] = genai.SchedulerConfig()
-    # Every round has the same prompt: with prefixes cached, prefill would be measured once and then skipped.
+    # Every round has the same prompt: a prefix cache would skip all prefills but the first.
     scheduler.enable_prefix_caching = False
     scheduler.max_num_batched_tokens = workload.prompt_tokens
     options |= {"INFERENCE_NUM_THREADS": request.threads, "ENABLE_CPU_PINNING": False}

@@ -1,4 +1,4 @@
-"""Our artifacts through the runner's own code: `Policy` and `LanguageModel`, prompt with image embeddings."""
+"""Worker of this project's artifacts with the runner's code: `Policy`, `LanguageModel`, image embeddings."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ HERE = SE2(0.0, 0.0, 0.0)
 
 
 def prompt(workload: Workload, artifacts: Artifacts) -> list[Segment]:
-    """The workload's prompt: a segment a frame, then the text."""
+    """Return the workload's prompt: one segment per frame, then the text."""
     runtime, vision = artifacts.runtime, workload.config.vision
     image = (runtime.img_start_id, *[runtime.img_context_id] * runtime.frame_tokens, runtime.img_end_id)
     frames = np.random.default_rng(3).standard_normal((FRAMES, 1, vision.tokens, vision.token_dim)).astype(np.float32)
@@ -30,7 +30,7 @@ def prompt(workload: Workload, artifacts: Artifacts) -> list[Segment]:
 
 
 def language(workload: Workload, artifacts: Artifacts, threads: int) -> Task:
-    """One generation of exactly DECODE_STEPS tokens."""
+    """Create the task of one generation of exactly DECODE_STEPS tokens."""
     model = LanguageModel(artifacts, threads=threads)
     segments = prompt(workload, artifacts)
 
@@ -47,7 +47,7 @@ def language(workload: Workload, artifacts: Artifacts, threads: int) -> Task:
 
 
 def load(request: Load) -> Mapping[str, Task]:
-    """Open the parts asked for."""
+    """Open the requested parts."""
     workload = Workload(request.model)
     artifacts = load_artifacts(Path(request.options["artifacts"]))
     tasks: dict[str, Task] = {}

@@ -1,10 +1,10 @@
-"""The worker's side of the protocol: JSON lines on standard input and output, one contender a process.
+"""Worker's side of the protocol: JSON lines on standard input and output, one process per contender.
 
     {"load": {...}}                → {"ok": true, "tasks": [...], "versions": {...}}
     {"run": TASK, "calls": N}      → {"ok": true, "values": {METRIC: [...]}, "wall_s": …, "cpu_s": …}
     {"end": true}                  → the worker exits
 
-Standard output of the libraries goes to standard error: only answers may be read as answers.
+The libraries' standard output is redirected to standard error, so that standard output has answers only.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Task = Callable[[], Mapping[str, float]]
 
 @dataclass(frozen=True)
 class Load:
-    """What a worker is asked to open."""
+    """Request to open parts of the model."""
 
     model: str
     cache: Path
@@ -35,13 +35,13 @@ class Load:
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> Load:
-        """From a message; raises ValueError on fields that are missing or not known."""
+        """Build the request from a message. Raises ValueError for missing or unknown fields."""
         if set(content) != {"model", "cache", "threads", "parts", "options"}:
             raise ValueError(f"load: unexpected fields {sorted(content)}")
         return cls(**{**content, "cache": Path(content["cache"]), "parts": tuple(content["parts"])})
 
     def of(self, part: str) -> dict[str, str]:
-        """The options of one part, without their prefix."""
+        """Return the options of one part, without their prefix."""
         return {key.partition(".")[2]: v for key, v in self.options.items() if key.startswith(part + ".")}
 
     def folder(self, runtime: str, part: str) -> Path:
@@ -50,19 +50,19 @@ class Load:
 
 
 def timed_ms(call: Callable[[], object]) -> float:
-    """Milliseconds that a call takes."""
+    """Measure a call, ms."""
     started_ns = time.monotonic_ns()
     call()
     return (time.monotonic_ns() - started_ns) / 1e6
 
 
 def timed_task(metric: str, call: Callable[[], object]) -> Task:
-    """One call, e.g. a frame through the encoder (`encoder_ms`)."""
+    """Create the task of one call, such as a frame through the encoder (`encoder_ms`)."""
     return lambda: {metric: timed_ms(call)}
 
 
 def language_task(prefill: Callable[[], int], step: Callable[[int], int], steps: int) -> Task:
-    """A prefill that returns the next token, then `steps` steps that each take it and return the one after."""
+    """Create the task of a prefill and `steps` decode steps, each of which reads a token and returns the next."""
 
     def run() -> dict[str, float]:
         started_ns = time.monotonic_ns()

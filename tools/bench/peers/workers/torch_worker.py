@@ -1,4 +1,4 @@
-"""PyTorch and transformers, eager: our encoder and unsplit action expert, and Qwen2ForCausalLM."""
+"""Worker of eager PyTorch and transformers: encoder, unsplit action expert, and Qwen2ForCausalLM."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FORMS = ("fp32", "bf16", "int8")
 
 
 def in_form(module: nn.Module, form: str) -> nn.Module:
-    """The module in bf16, or with dynamically quantised linear layers."""
+    """Convert the module to bf16, or quantise its linear layers dynamically."""
     if form not in FORMS:
         raise ValueError(f"form {form!r}: expected one of {FORMS}")
     if form == "int8":
@@ -56,7 +56,7 @@ class Decoder:
 
 
 def load(request: Load) -> Mapping[str, Task]:
-    """Open the parts asked for."""
+    """Open the requested parts."""
     torch.set_num_threads(request.threads)
     workload, reference = Workload(request.model), request.cache / request.model / "reference"
     form = {part: request.options.get(f"{part}.form", "bf16") for part in request.parts}

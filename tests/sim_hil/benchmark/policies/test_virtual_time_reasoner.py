@@ -10,7 +10,7 @@ from edge.reasoning.generation_cycle import Mode, ReasoningConfig
 from edge.state.ring import EncodedFrame, TokenRing
 from edge.state.semantic import SemanticSlot, SharedState
 from sim_hil.benchmark.conditions.latency import Timing
-from sim_hil.benchmark.policies.lockstep_reasoner import VirtualTimeReasoner
+from sim_hil.benchmark.policies.virtual_time_reasoner import VirtualTimeReasoner
 from tests.support.runner.reasoning_bench import KV, FakeLanguage, FakePolicy
 
 TICK_NS = 100_000_000

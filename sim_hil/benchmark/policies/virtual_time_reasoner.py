@@ -1,4 +1,4 @@
-"""The generation cycle in virtual time (paper appendix D, Algorithms 3 and 4): started at t, released at t + L.
+"""The generation cycle in virtual time (paper appendix D, Algorithms 3 and 4): starts at t, is released at t + L.
 
 No thread and no clock: call `release` before each tick of the control loop, `start` after it. A generation is computed
 when it is released, from the frames that it captured, so the computer's speed changes nothing.
@@ -30,7 +30,7 @@ from sim_hil.benchmark.conditions.latency import Timing
 
 @dataclass(frozen=True)
 class _UnderWay:
-    """A generation that was started; its anchor is set once its newest frame was captured."""
+    """Generation in progress; its anchor is set when its newest frame is captured."""
 
     started_ns: int
     timing: Timing
@@ -46,7 +46,7 @@ class _UnderWay:
 
 
 class VirtualTimeReasoner:
-    """One generation at a time; the next starts when the one before is released (sync: once the robot stands)."""
+    """Runs one generation at a time; the next starts at the release (sync: when the robot stands)."""
 
     def __init__(
         self,
@@ -64,18 +64,18 @@ class VirtualTimeReasoner:
         self._draw = draw
         self._under_way: _UnderWay | None = None
         self.cycle = GenerationCycle(config)
-        """Counts of generations, and why reasoning has ended."""
+        """Generation cycle with its counts, and the reason for the end of reasoning."""
         self._slot.drive_until_ns = self.cycle.drive_until_ns
         self.released: list[Mapping[str, Any]] = []
-        """One record per generation with a result, as JSON values."""
+        """Record of every generation with a result, as JSON values."""
 
     @property
     def started_ns(self) -> int | None:
-        """When the generation under way was started, ns; None while there is none."""
+        """Start of the current generation, ns; None without one."""
         return None if self._under_way is None else self._under_way.started_ns
 
     def release(self, now_ns: int) -> None:
-        """Before a tick: compute and publish the generation under way if it is due."""
+        """Compute and publish the current generation if it is due; call this before each tick."""
         under_way = self._under_way
         if under_way is None or under_way.task.anchor is None or now_ns < under_way.release_ns:
             return
@@ -90,7 +90,7 @@ class VirtualTimeReasoner:
         self._publish(under_way, result, outputs, now_ns)
 
     def start(self, now_ns: int) -> None:
-        """After a tick, which has put its frame into the ring: start a generation, or capture a late newest frame."""
+        """Start a generation, or capture a late newest frame; call this after each tick, whose frame is in the ring."""
         if self._under_way is None:
             outputs = self._advance(now_ns)
             if outputs.action is Action.START:
@@ -105,7 +105,7 @@ class VirtualTimeReasoner:
         return self.cycle.step(CycleInputs(self._ring.newest(2), event=event), now_ns)
 
     def _capture(self, task: GenerationTask, now_ns: int) -> None:
-        """Take the newest frame and those before it, as the reasoning thread selects them."""
+        """Capture the newest frame and the older ones that the reasoning thread would select."""
         newest_ns = self._ring.newest_ns
         anchor = None if newest_ns is None else self._ring.nearest(newest_ns)
         if anchor is None:
