@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from collections import deque
@@ -181,11 +180,6 @@ def test_a_worker_that_is_silent_for_too_long_is_killed(
     monkeypatch.setattr(worker_pool, "SILENT_S", 2.0)
     events = run_all(command, deque([job(tmp_path, "a", hangs=True)]))
     assert events[-1].failure.startswith("ended by SIGKILL")
-
-
-def test_without_a_number_of_jobs_there_is_one_per_core(command: list[str]) -> None:
-    with Workers(command, 0) as workers:
-        assert workers.free() == len(os.sched_getaffinity(0))
 
 
 def test_fewer_jobs_than_none_are_refused(command: list[str]) -> None:

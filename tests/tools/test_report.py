@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from hypothesis import strategies as st
 from edge.flightlog.recorder import Recorder
 from firmware_bridge.output_file import partial_of
 from reporting import page
+from tests.support.html_page import HtmlPage, assert_loads_nothing
 from tests.support.runner import synthetic_run
 from tools.report import checks, demo_report, run_data
 from tools.report.demo_report import RunFiles, load_run, spread, write_report
@@ -60,44 +60,20 @@ def _failed(found: dict[str, checks.Check]) -> set[str]:
 # ---- the page
 
 
-class _Collector(HTMLParser):
-    def __init__(self) -> None:
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.text: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_data(self, data: str) -> None:
-        self.text.append(data)
-
-
-def _parse(html: str) -> _Collector:
-    parser = _Collector()
-    parser.feed(html)
-    return parser
-
-
 @pytest.mark.slow
 def test_the_page_loads_nothing_from_anywhere(html: str) -> None:
-    for tag, attributes in _parse(html).tags:
-        assert tag not in {"script", "link", "iframe", "object", "embed", "base"}
-        assert "href" not in attributes and "srcset" not in attributes
-        if "src" in attributes:
-            assert str(attributes["src"]).startswith("data:image/")
-    assert "url(" not in html and "@import" not in html
+    assert_loads_nothing(html)
 
 
 def test_the_models_text_cannot_act_on_the_page(html: str) -> None:
     assert "<script>alert" not in html
     assert "\u202e" not in html
-    shown = "".join(_parse(html).text)
+    shown = "".join(HtmlPage(html).pieces)
     assert 'turn </pre><script>alert("x")</script> ⟨U+202E⟩left⟨U+0007⟩ & <b>go</b> \U0001f916' in shown
 
 
 def test_every_picture_decodes(html: str) -> None:
-    pictures = [attributes["src"] for tag, attributes in _parse(html).tags if tag == "img"]
+    pictures = [attributes["src"] for tag, attributes in HtmlPage(html).tags if tag == "img"]
     assert len(pictures) == 4 + len(synthetic_run.generations(12.0))
     for uri in pictures:
         assert uri is not None
@@ -119,7 +95,7 @@ def test_untrained_weights_are_said_plainly(html: str) -> None:
 def _row_of(html: str, title: str) -> list[str]:
     """The cells of the first table row that holds this text."""
     row = next(row for row in html.split("<tr>") if title in row)
-    return ["".join(_parse(cell).text) for cell in row.split("</tr>")[0].split("</td>")[:-1]]
+    return ["".join(HtmlPage(cell).pieces) for cell in row.split("</tr>")[0].split("</td>")[:-1]]
 
 
 def test_commands_written_are_those_the_bridge_counted(html: str, summary: dict[str, Any]) -> None:

@@ -224,11 +224,6 @@ def test_other_programs_that_compute_are_named_and_this_one_is_not() -> None:
     assert busy_programs(before, before, 100, own=2).level is Level.OK
 
 
-def test_a_check_that_warns_has_to_say_what_to_do() -> None:
-    with pytest.raises(ValueError, match="what to do"):
-        Check("x", Level.FAIL, "found", "expected")
-
-
 def test_only_failures_fail() -> None:
     warning = Check("x", Level.WARN, "found", "expected", "advice")
     assert not failed([warning, skipped("y", "not here")])

@@ -125,21 +125,11 @@ class Calls(ThreadCalls):
 CONTROL = Role("control", (3,), 50, -10)
 
 
-def test_a_role_is_cores_and_real_time_priority() -> None:
-    machine = Calls()
-    assert enter(CONTROL, machine) == []
-    assert machine.done == [("cores", (3,)), ("fifo", 50)]
-
-
 def test_where_real_time_priority_is_refused_niceness_is_tried_and_the_operator_told_once() -> None:
     machine = Calls("fifo")
     [line] = enter(CONTROL, machine)
     assert "LimitRTPRIO=50" in line
     assert machine.done == [("cores", (3,)), ("niceness", -10)]
-
-
-def test_nothing_that_is_refused_is_an_error() -> None:
-    assert len(enter(CONTROL, Calls("cores", "fifo", "niceness"))) == 2
 
 
 def test_threads_started_in_a_role_inherit_its_urgency() -> None:

@@ -45,10 +45,6 @@ def until(reached: Callable[[], bool]) -> bool:
     return reached()
 
 
-def test_before_the_first_step_nothing_is_limited() -> None:
-    assert monitor(steady()).budget().allowed
-
-
 def test_a_meter_that_works_gives_samples_records_and_statistics() -> None:
     records: list[tuple[int, dict[str, Any]]] = []
     running = monitor(steady(), on_sample=lambda stamp_ns, record: records.append((stamp_ns, record)))

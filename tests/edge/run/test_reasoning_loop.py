@@ -9,7 +9,7 @@ from collections.abc import Callable
 import pytest
 
 from edge.reasoning.decoding_rules import DecodingContext
-from edge.reasoning.generation_cycle import FAILURES, ReasoningBudget
+from edge.reasoning.generation_cycle import ReasoningBudget
 from edge.run.reasoning_loop import ReasoningLoop
 from edge.state.switches import Decoding
 from tests.support.runner.reasoning_bench import TEXT, Bench, Clock, FakeRun
@@ -49,17 +49,6 @@ def test_what_is_recorded_is_what_was_published(bench: Bench) -> None:
 
 
 # Release delay
-
-
-def test_until_the_new_state_is_released_the_old_one_stays() -> None:
-    with Bench(delay_s=0.2) as bench:
-        bench.frame(2.0)
-        bench.wait_for(lambda: bench.cycle.published == 1)
-        first = bench.slot.state
-        bench.frame(3.0)
-        bench.wait_for(lambda: len(bench.language.prompts) == 2)
-        assert bench.slot.state is first
-        bench.wait_for(lambda: bench.slot.state is not first)
 
 
 def test_a_stop_ends_a_generation_that_is_held_back() -> None:
@@ -133,20 +122,6 @@ def test_a_generation_under_way_ends_when_the_budget_is_withdrawn(bench: Bench) 
     bench.frame(2.0)
     assert not bench.loop.step()
     assert (bench.slot.state, bench.cycle.cancelled) == (None, 1)
-
-
-def test_failures_in_quick_succession_end_reasoning_for_good(bench: Bench, clock: Clock) -> None:
-    bench.language.broken = FAILURES
-    for second in range(FAILURES):
-        assert bench.cycle.failure is None
-        clock.s += 10.0
-        bench.frame(float(second))
-        bench.loop.step()
-    assert bench.cycle.failure is not None and "language_model: broken" in bench.cycle.failure
-    assert len(bench.said) == 1
-    clock.s += 1000.0
-    bench.frame(99.0)
-    assert not bench.loop.step()
 
 
 # Late anchor
