@@ -65,7 +65,7 @@ def test_a_known_scale_and_bias_are_found(known: tuple[Path, Path], tmp_path: Pa
     assert math.degrees(found.gyro_bias_radps) == pytest.approx(0.3, abs=0.05)
 
 
-def test_what_the_drive_does_not_show_stays_as_uncertain_as_before(known: tuple[Path, Path], tmp_path: Path) -> None:
+def test_parameters_that_the_drive_does_not_excite_stay_uncertain(known: tuple[Path, Path], tmp_path: Path) -> None:
     log, truth = known
     out = tmp_path / "robot.odometry.toml"
     main(["odometry", str(log), "--truth", str(truth), "--out", str(out)])
@@ -106,14 +106,14 @@ def test_a_drive_too_short_to_tell_is_not_written(tmp_path: Path, capsys: pytest
     assert "not good enough" in capsys.readouterr().err
 
 
-def test_odometry_that_has_nothing_to_do_with_the_truth_is_not_explained(tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
+def test_odometry_unrelated_to_the_truth_is_not_fitted(tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
     log = write_log(tmp_path / "d.mcap", drive(26, wz_radps=0.1))
     truth = write_truth(tmp_path / "t.jsonl", drive(26, wz_radps=-0.5, vx_mps=0.2))
     assert main(["odometry", str(log), "--truth", str(truth)]) == 1
     assert "do not describe the same drive" in capsys.readouterr().err
 
 
-def test_an_interrupted_calibration_says_so(
+def test_an_interrupted_calibration_reports_the_interrupt(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def interrupt(_path: Path) -> None:

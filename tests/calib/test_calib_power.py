@@ -176,7 +176,7 @@ def options(*arguments: str) -> argparse.Namespace:
     return parser.parse_args(list(arguments))
 
 
-def test_a_device_without_a_meter_is_refused_with_what_was_looked_for(
+def test_a_device_without_a_meter_is_refused_with_every_meter_that_was_tried(
     artifacts_dir: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(options("--artifacts", str(artifacts_dir)), TREES / "no_meter") == EXIT_REFUSED

@@ -109,7 +109,7 @@ class TestEveryDanger:
         bench.drive(1000)
         assert set(bench.moves()) <= {ZERO}
 
-    def test_a_refused_arm_is_told_as_arming_first(self, danger, cause: str) -> None:
+    def test_a_refused_arm_is_reported_as_arming_first(self, danger, cause: str) -> None:
         """A runner that asked must be able to tell a refusal from the state before it asked."""
         bench = Bench()
         danger(bench)
@@ -179,14 +179,14 @@ class TestIdentity:
         assert (bench.status.state, bench.status.cause) == ("disarmed", "wrong_robot")
         assert bench.written == []
 
-    def test_a_robot_that_does_not_say_what_it_is_is_not_armed(self) -> None:
+    def test_a_robot_without_an_identity_is_not_armed(self) -> None:
         bench = Bench(version=None)
         bench.step(Arm())
         bench.wait(10_100)
         assert bench.status.reason == "arm refused: the robot's sport service does not answer after 10 s"
         assert bench.written == []
 
-    def test_it_is_asked_again_at_every_arming(self) -> None:
+    def test_its_identity_is_requested_at_every_arming(self) -> None:
         bench = Bench().arm()
         bench.step(Stop())
         bench.version = "1.0.0.9"
@@ -204,7 +204,7 @@ class TestSecondCommander:
         bench.wait(200)
         bench.arm()
 
-    def test_who_uses_a_disarmed_robot_is_none_of_our_business(self) -> None:
+    def test_other_commanders_of_a_disarmed_robot_are_ignored(self) -> None:
         bench = Bench()
         for _ in range(50):
             bench.step(foreign="sport 1008")
@@ -240,7 +240,7 @@ class TestRemote:
 
 
 class TestStopAgain:
-    def test_a_robot_that_goes_on_moving_is_told_again_until_it_has_been_still_for_half_a_second(self) -> None:
+    def test_a_robot_that_goes_on_moving_is_stopped_again_until_it_has_been_still_for_half_a_second(self) -> None:
         bench = Bench().arm()
         bench.robot = {"vx_mps": 0.5}
         bench.drive(500)
@@ -312,7 +312,7 @@ class TestFoundMoving:
         bench.step(remote_in_use=True)
         assert [request for _, request in bench.written] == [ZERO, STOP_MOVE]
 
-    def test_a_robot_that_begins_to_move_later_is_somebody_elses(self) -> None:
+    def test_a_robot_that_begins_to_move_later_is_left_to_its_commander(self) -> None:
         bench = Bench(client=False)
         bench.wait(1100)
         bench.robot = {"vx_mps": 0.3}

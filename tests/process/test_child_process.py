@@ -70,7 +70,7 @@ def test_a_line_is_returned_once_it_is_whole() -> None:
         process.close(PATIENCE_S)
 
 
-def test_what_is_sent_reaches_the_childs_standard_input() -> None:
+def test_a_sent_line_reaches_the_childs_standard_input() -> None:
     process = child("import sys; print(sys.stdin.readline().upper(), end='')")
     try:
         assert process.send(b"hello")
@@ -90,7 +90,7 @@ def test_an_answer_that_does_not_come_is_a_timeout() -> None:
         process.close(1.0)
 
 
-def test_sending_to_a_dead_child_is_told_apart() -> None:
+def test_sending_to_a_dead_child_raises_its_own_error() -> None:
     process = child("")
     assert process.wait(PATIENCE_S) == 0
     assert not process.send(b"hello")

@@ -108,7 +108,9 @@ def test_the_log_of_an_episode_has_a_row_a_control_period(two_jobs: Path) -> Non
     assert log["columns"]["odom_x_m"][-1] != pytest.approx(log["columns"]["x_m"][-1] - 1.0, abs=1e-4)
 
 
-def test_without_an_output_directory_the_result_is_only_told(suite: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_an_output_directory_the_result_is_only_printed(
+    suite: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.main(["--suite", str(suite), "--episodes", "walk-1", "--policy", "still", "--json", "-"]) == 0
     (episode,) = json.loads(capsys.readouterr().out)["episodes"]
     assert episode["end"] == "timeout" and episode["path_m"] < 0.05

@@ -209,7 +209,7 @@ def test_a_manifest_has_defaults_of_the_switches(copy: Path, change: Edit, switc
     assert (runtime.decoding, runtime.recovery) == switches
 
 
-def test_a_graph_that_is_not_what_the_manifest_says_is_refused_when_opened(copy: Path) -> None:
+def test_a_graph_that_differs_from_the_manifest_is_refused_when_opened(copy: Path) -> None:
     replace(copy, "action_expert.onnx", (copy / "semantic_context.onnx").read_bytes())
     with pytest.raises(ArtifactError, match="not those of the manifest"):
         Graph(load_artifacts(copy), "action_expert", threads=1)
@@ -227,7 +227,7 @@ def test_weights_outside_the_graph_cannot_be_reached(copy: Path, monkeypatch: py
         load_artifacts(copy)
 
 
-def test_a_tokenizer_that_is_none_is_refused(copy: Path) -> None:
+def test_an_invalid_tokenizer_is_refused(copy: Path) -> None:
     replace(copy, "tokenizer.json", b"{}")
     with pytest.raises(ArtifactError, match="not a tokenizer"):
         LanguageModel(load_artifacts(copy))

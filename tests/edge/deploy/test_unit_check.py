@@ -126,7 +126,7 @@ def test_every_line_of_verify_is_a_complaint_unless_it_is_about_another_unit(
     assert (verdict.good, len(verdict.others)) == (good, others)
 
 
-def test_an_old_systemd_that_cannot_score_files_is_said_to_be_one() -> None:
+def test_an_old_systemd_that_cannot_score_files_is_reported() -> None:
     verdict = checked((0, ""), (1, "systemd-analyze: unrecognized option '--offline=true'\n"))
     assert verdict.good
     assert "systemd 250" in verdict.not_checked[0]

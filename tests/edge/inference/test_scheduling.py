@@ -51,12 +51,12 @@ def schedule(
 # Which cores
 
 
-def test_the_targets_cores_are_used_where_there_are_such() -> None:
+def test_the_targets_cores_are_used_where_they_exist() -> None:
     made = schedule(range(8), control=(7,), reasoning=(4, 5, 6))
     assert (made.control.cores, made.reasoning.cores, made.shared, made.notes) == ((7,), (4, 5, 6), False, ())
 
 
-def test_cores_that_this_process_may_not_use_are_told_and_not_insisted_on() -> None:
+def test_cores_that_this_process_may_not_use_are_reported_and_not_required() -> None:
     made = schedule({0, 1}, control=(7,))
     assert made.control.cores == ()
     assert made.notes == ("the target gives control cores 7, this process may use 0, 1: it runs on any of them",)
@@ -76,7 +76,7 @@ def test_with_no_core_to_spare_both_may_run_anywhere_and_reasoning_gives_way() -
     assert (made.control.cores, made.reasoning.cores, made.shared) == ((), (), True)
 
 
-def test_on_one_accelerator_reasoning_gives_way_whatever_the_cores() -> None:
+def test_on_one_accelerator_reasoning_gives_way_for_any_cores() -> None:
     assert schedule(range(8), control=(7,), reasoning=(4, 5, 6), one_device=True).shared
 
 
@@ -125,7 +125,7 @@ class Calls(ThreadCalls):
 CONTROL = Role("control", (3,), 50, -10)
 
 
-def test_where_real_time_priority_is_refused_niceness_is_tried_and_the_operator_told_once() -> None:
+def test_where_real_time_priority_is_refused_niceness_is_tried_and_reported_once() -> None:
     machine = Calls("fifo")
     [line] = enter(CONTROL, machine)
     assert "LimitRTPRIO=50" in line
@@ -263,7 +263,7 @@ class FakeTime:
         self.now_ns += round(seconds * 1e9)
 
 
-def test_giving_way_waits_as_long_as_told_and_counts_it() -> None:
+def test_giving_way_waits_the_requested_time_and_counts_it() -> None:
     time, activity = FakeTime(), TickActivity(PERIOD_NS)
     activity.begin(0)
     way = GiveWay(activity, clock=time.clock, sleep=time.sleep)

@@ -160,7 +160,7 @@ def test_no_speed_scale_raises_a_limit_and_one_that_is_no_share_gives_no_speed(s
     assert driven(scale, plan(0.5))[0] == pytest.approx(LIMITS.vx_max_mps if scale > 1 else 0.0)
 
 
-def test_a_reason_to_hold_is_zero_whatever_the_plan_and_speeding_up_begins_anew() -> None:
+def test_a_reason_to_hold_gives_zero_for_any_plan_and_restarts_the_slew_limit() -> None:
     controller = Controller(CONFIG)
     for tick in range(20):
         controller.step(fresh(plan(0.08)), tick * TICK_NS)

@@ -88,7 +88,7 @@ def test_a_meter_that_hangs_costs_its_value_and_nobody_waits_for_it() -> None:
 
 
 @pytest.mark.parametrize("error", [MeterError("gone"), OSError("i2c"), ValueError("nonsense")])
-def test_a_meter_that_raises_is_asked_again_and_its_error_is_kept(error: Exception) -> None:
+def test_a_meter_that_raises_is_read_again_and_its_error_is_kept(error: Exception) -> None:
     answers: list[Exception | None] = [error, error, None]
 
     def read(now_ns: int) -> PowerSample:
@@ -113,7 +113,7 @@ def test_a_sample_that_is_old_counts_as_none() -> None:
     assert running.step(SECOND + SECOND).sample is None
 
 
-def test_without_a_meter_the_result_says_that_there_was_none() -> None:
+def test_without_a_meter_the_result_names_none() -> None:
     running = monitor(None)
     running.step(SECOND)
     assert running.statistics() == {"mean": None, "p99": None, "source": "none", "tagged": "modelled"}
@@ -166,7 +166,7 @@ class Charge:
     soc_percent: float | None = 5.0
 
 
-def test_a_charge_of_long_ago_says_nothing_of_now() -> None:
+def test_an_old_charge_report_is_ignored() -> None:
     running = monitor(None, battery=lambda: Charge(SECOND))
     assert running.step(12 * SECOND).outputs.findings == ()
     assert running.step(10 * SECOND).outputs.findings == ("battery-empty", "battery-low")

@@ -39,7 +39,7 @@ def test_delay_at_release_counts_from_the_capture_of_the_newest_frame(bench: Ben
     assert bench.slot.state is not None and bench.slot.state.ready_ns == clock()
 
 
-def test_what_is_recorded_is_what_was_published(bench: Bench) -> None:
+def test_the_recorded_state_is_the_published_one(bench: Bench) -> None:
     bench.frame(2.0)
     bench.loop.step()
     [record] = bench.records

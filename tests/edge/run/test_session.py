@@ -205,7 +205,7 @@ def test_a_thread_that_dies_while_the_robot_is_waited_for_is_a_refusal(rig: Rig)
     ("error", "fault"),
     [(BridgeUnavailable("gone"), "bridge lost: gone"), (OSError("no"), "control thread died: OSError: no")],
 )
-def test_when_a_thread_dies_the_robot_is_stopped_with_the_fault_known_and_before_the_end(
+def test_when_a_thread_dies_the_robot_is_stopped_with_the_fault_before_the_end(
     rig: Rig, error: Exception, fault: str
 ) -> None:
     def fail() -> None:

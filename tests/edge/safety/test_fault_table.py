@@ -36,7 +36,7 @@ def test_the_test_that_injects_a_fault_exists(fault: Fault) -> None:
         body = found[0].body
 
 
-def test_what_is_found_by_the_code_is_in_the_table() -> None:
+def test_every_finding_of_the_code_is_in_the_table() -> None:
     found = {
         name
         for path in (ROOT / "edge").rglob("*.py")
@@ -47,7 +47,7 @@ def test_what_is_found_by_the_code_is_in_the_table() -> None:
     assert found and found <= set(FAULTS)
 
 
-def test_what_the_runner_is_said_to_notice_it_does_notice() -> None:
+def test_the_runner_notices_every_fault_that_the_table_assigns_to_it() -> None:
     named = {
         name
         for path in (ROOT / "edge").rglob("*.py")

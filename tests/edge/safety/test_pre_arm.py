@@ -88,5 +88,5 @@ def test_a_board_about_to_switch_off_from_heat_blocks_arming(desk: Desk) -> None
     assert "switch itself off" in desk.run(1, Finding("thermal-trip", "104 °C"))
 
 
-def test_what_only_lowers_the_speed_is_not(desk: Desk) -> None:
+def test_a_fault_that_only_lowers_the_speed_does_not_block_arming(desk: Desk) -> None:
     assert desk.run(2, Finding("battery-low", "15 %")) == ""

@@ -63,7 +63,7 @@ def test_a_file_that_is_not_there_and_an_unknown_preset_are_refused(tmp_path: Pa
         config_for("7b")
 
 
-def test_overrides_are_read_as_what_the_field_is() -> None:
+def test_overrides_are_parsed_by_the_type_of_their_field() -> None:
     config = with_overrides(
         NANO,
         {

@@ -84,7 +84,7 @@ def test_without_motion_offset_only_the_time_counts() -> None:
         assert not torch.equal(act(model, kv, [2.0, 0.0, 0.0, 0.0]), act(model, kv, [3.0, 0.0, 0.0, 0.0]))
 
 
-def test_values_only_does_not_look_at_the_keys() -> None:
+def test_values_only_ignores_the_keys() -> None:
     kv = torch.randn(1, 20, NANO.kv_dim)
     other = kv.clone()
     other[..., : NANO.kv_dim // 2] += 1

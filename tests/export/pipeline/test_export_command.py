@@ -33,7 +33,7 @@ def test_an_interrupt_while_modules_load_is_no_traceback(
 @pytest.mark.parametrize(
     ("arguments", "kept"), [([], "finished stages are in the cache"), (["--no-cache"], "nothing was kept")]
 )
-def test_an_interrupt_says_what_is_left(
+def test_an_interrupt_names_the_remaining_parts(
     arguments: list[str],
     kept: str,
     tmp_path: Path,

@@ -44,9 +44,7 @@ def test_a_failed_swap_puts_the_old_directory_back(
     load_artifacts(out)
 
 
-def test_an_existing_directory_that_is_not_ours_is_not_touched(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_foreign_directory_is_not_touched(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter1.tex").write_text("years of work")
     assert main(["--out", str(tmp_path / "thesis")]) == 2
@@ -101,7 +99,7 @@ def test_a_second_export_into_one_directory_is_refused(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_a_killed_export_was_replacing_comes_back(artifacts_dir: Path, tmp_path: Path) -> None:
+def test_the_directory_that_a_killed_export_replaced_is_restored(artifacts_dir: Path, tmp_path: Path) -> None:
     work = tmp_path / ".nano.edge-export"
     shutil.copytree(artifacts_dir, work / "old")
     (work / "new").mkdir()

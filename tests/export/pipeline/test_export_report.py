@@ -61,13 +61,13 @@ def test_graphs_come_in_the_order_in_which_they_run(report: dict[str, Any]) -> N
     assert places == sorted(places)
 
 
-def test_untrained_weights_are_said_plainly_and_trained_ones_are_not(changed: dict[str, Any]) -> None:
+def test_untrained_weights_are_marked_and_trained_ones_are_not(changed: dict[str, Any]) -> None:
     assert "The weights are untrained" in report_html(changed)
     changed["model"]["trained"] = True
     assert "untrained" not in report_html(changed)
 
 
-def test_a_graph_that_ran_elsewhere_than_it_will_is_said_plainly(changed: dict[str, Any]) -> None:
+def test_a_graph_checked_on_another_provider_is_marked(changed: dict[str, Any]) -> None:
     assert "repeat this check" not in report_html(changed)
     changed["graphs"]["vision_encoder"]["session"]["provider"] = "TensorrtExecutionProvider"
     changed["graphs"]["vision_encoder"]["parity"]["shipping_provider_checked"] = False
@@ -84,7 +84,7 @@ def test_a_warning_is_shown_with_its_reason(changed: dict[str, Any]) -> None:
     assert "action_expert : cosine 0.995 (≥ 0.999)" in text
 
 
-def test_a_plan_that_does_not_fit_says_why(changed: dict[str, Any]) -> None:
+def test_a_plan_that_does_not_fit_gives_the_reason(changed: dict[str, Any]) -> None:
     changed["plan"] |= {"fits": False, "reasons": ["tick 250 ms exceeds the period of 100 ms"], "generation_ms": None}
     text = text_of(changed)
     assert "Does not fit: tick 250 ms exceeds the period of 100 ms" in text

@@ -64,7 +64,7 @@ def test_the_stock_25_watt_mode_is_refused_with_what_exceeds_by_how_much_and_wha
         ("rtx4060", "device.memory_gib=4", "exceeds the 3.00 GiB"),
     ],
 )
-def test_a_plan_that_exceeds_power_age_or_memory_says_which(name: str, setting: str, reason: str) -> None:
+def test_a_plan_that_exceeds_power_age_or_memory_names_the_limit(name: str, setting: str, reason: str) -> None:
     made = planned(name, setting)
     assert not made.fits and any(reason in line for line in made.reasons)
 
@@ -93,7 +93,7 @@ def test_a_tick_waits_at_most_for_the_call_in_flight_where_both_threads_share_a_
     assert made.tick.ms == pytest.approx(made.tick_alone.ms + longest, abs=1e-3)
 
 
-def test_a_development_machine_says_what_it_cannot_do_in_time_and_is_not_made_to_stop() -> None:
+def test_a_development_machine_reports_its_late_stages_and_is_not_refused() -> None:
     made = planned("cpu")
     assert not made.fits
     assert not target("cpu").runtime.enforce_plan
@@ -126,7 +126,7 @@ def with_point(base: Target, **changes: object) -> Target:
     return dataclasses.replace(base, measured=(point,))
 
 
-def test_a_measured_point_replaces_the_model_and_says_where_it_was_taken() -> None:
+def test_a_measured_point_replaces_the_model_and_names_its_device() -> None:
     entry = stage(plan(with_point(target("orin")), BIG), "vision_encoder")
     assert (entry["ms"], entry["tagged"], entry["bound"]) == (61.5, MEASURED, MEASURED)
     assert "the board in the laboratory, 2026-11-21" in entry["source"]

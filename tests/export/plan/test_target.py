@@ -49,7 +49,7 @@ def test_every_figure_names_its_source_and_whether_it_was_measured(name: str) ->
 
 
 @pytest.mark.parametrize("name", ["orin", "rtx4060"])
-def test_what_was_not_at_hand_is_nowhere_called_measured(name: str) -> None:
+def test_targets_without_a_device_have_no_measured_figure(name: str) -> None:
     target = load_target(name)
     assert {figure.tag for figure in figures(target)} == {MODELLED}
     assert not target.measured

@@ -184,7 +184,7 @@ def test_a_second_commander_gets_the_robot_zeroed_and_the_bridge_latched(
 
 
 @pytest.mark.slow
-def test_somebody_who_only_asks_is_no_commander(
+def test_a_client_that_only_reads_is_no_commander(
     robot: FakeGo2, bridge: Running, socket_path: Path, tmp_path: Path
 ) -> None:
     with driver(socket_path, tmp_path):

@@ -207,12 +207,12 @@ def _choose(hall: Scene, other: tuple[float, float, float, float], share: float)
 
 
 @pytest.mark.parametrize("other", [(50.0, 0.0, 0.0, 0.0), (-1.0, 0.0, 1.2, 0.0)], ids=["far ahead", "behind"])
-def test_somebody_out_of_the_way_changes_nothing(hall: Scene, other: tuple[float, float, float, float]) -> None:
+def test_a_person_beside_the_path_changes_nothing(hall: Scene, other: tuple[float, float, float, float]) -> None:
     assert _choose(hall, other, 1)[:2] == (pytest.approx(1.2), pytest.approx(0.0, abs=1e-9))
 
 
 @pytest.mark.parametrize(("other", "share"), [((2.0, 0.0, -1.2, 0.0), 2), ((1.5, 0.05, 0.0, 0.0), 1)])
-def test_somebody_in_the_way_is_passed_on_the_right(
+def test_a_person_in_the_path_is_passed_on_the_right(
     hall: Scene, other: tuple[float, float, float, float], share: float
 ) -> None:
     vx, vy, meet_s = _choose(hall, other, share)

@@ -31,7 +31,7 @@ def nothing_is_started(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("name", [None, "", ":1234", "127.0.0.1:1234", "nonsense", ":", "/no/such/socket:0"])
-def test_a_display_that_is_not_there_is_one_line(
+def test_a_missing_display_is_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], name: str | None
 ) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)

@@ -123,7 +123,7 @@ def test_a_motor_never_gives_more_than_its_limit_nor_drives_beyond_its_top_speed
             assert torque * speed <= 0.0
 
 
-def test_a_wheel_that_was_blocked_lets_go_when_it_may_stop() -> None:
+def test_a_blocked_wheel_is_released_by_a_stop() -> None:
     controller = DriveController(DT_S)
     controller.powered = True
     for _ in range(480):

@@ -270,7 +270,7 @@ def test_a_running_simulation_keeps_no_files(
     simulation.close()
 
 
-def test_a_simulation_whose_window_was_closed_says_so_and_can_still_be_closed(simulation: Simulation) -> None:
+def test_a_closed_window_is_reported_and_the_simulation_can_still_be_closed(simulation: Simulation) -> None:
     simulation.step()
     pybullet.disconnect(physicsClientId=simulation.client)  # what closing the window does
     for call in (simulation.step, simulation.truth):

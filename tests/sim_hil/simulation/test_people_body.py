@@ -53,7 +53,7 @@ def _row(**changes: float) -> np.ndarray:
     return row
 
 
-def test_hardly_two_of_sixty_people_look_alike() -> None:
+def test_sixty_people_differ_in_appearance() -> None:
     looks = appearances(60, 0, "office")
     assert len({(look.shirt, look.trousers, look.hair, look.hair_style, look.top, look.legs) for look in looks}) > 55
 
@@ -72,13 +72,13 @@ def test_adults_have_the_heights_of_adults() -> None:
         ("office", {"vest"}, (0, 0)),
     ],
 )
-def test_people_are_dressed_for_where_they_are(scene: str, clothes: set[str], share: tuple[float, float]) -> None:
+def test_clothes_fit_the_scene(scene: str, clothes: set[str], share: tuple[float, float]) -> None:
     worn = np.mean([look.top in clothes for look in appearances(200, 2, scene)])
     assert share[0] <= worn <= share[1]
 
 
 @pytest.mark.parametrize("index", range(12))
-def test_a_person_stands_on_the_ground_and_is_as_tall_as_the_look_says(index: int) -> None:
+def test_a_person_stands_on_the_ground_and_has_the_height_of_the_appearance(index: int) -> None:
     look = appearances(12, 4, "warehouse" if index % 2 else "hospital")[index]
     stage = FakeStage()
     PersonBody(stage, look).pose(_row(swing=0.0, ground=0.14))

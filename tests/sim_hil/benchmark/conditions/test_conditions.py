@@ -79,7 +79,7 @@ def test_an_artifact_directory_means_the_same_in_a_worker_elsewhere() -> None:
         (("--policy", "external:h:1", "--external-timeout", "0"), "external timeout"),
     ],
 )
-def test_what_contradicts_itself_is_refused_in_one_line(arguments: tuple[str, ...], says: str) -> None:
+def test_contradictory_conditions_are_refused_in_one_line(arguments: tuple[str, ...], says: str) -> None:
     with pytest.raises(ConditionsError, match=says) as caught:
         asked(*arguments)
     assert "\n" not in str(caught.value)

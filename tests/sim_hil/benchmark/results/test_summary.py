@@ -54,7 +54,7 @@ def test_one_episode_has_no_interval_and_none_has_no_rate() -> None:
     assert mean_ci95([1.0], ["a"]) is None and summarise([])["sr"] is None
 
 
-def test_episodes_that_repeat_one_task_tell_no_more_than_the_task() -> None:
+def test_repeated_episodes_of_one_task_do_not_narrow_the_interval() -> None:
     # 10 tasks of 5 episodes, of which all or none is reached: as uncertain as 10 episodes, not as 50.
     values = [100.0 * (task % 2) for task in range(10) for _ in range(5)]
     tasks = [f"task-{task}" for task in range(10) for _ in range(5)]
@@ -132,7 +132,7 @@ def run_of(folder: Path, results: list[fakes.EpisodeResult], suite: str = "dynan
     return folder
 
 
-def test_compare_says_both_runs_and_their_difference(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_compare_prints_both_runs_and_their_difference(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     a, b = run_of(tmp_path / "a", [fakes.missed("e1"), fakes.missed("e3")]), run_of(tmp_path / "b", mixed(4))
     assert cli.main(["compare", str(a), str(b)]) == 0
     said = capsys.readouterr().out
@@ -140,7 +140,7 @@ def test_compare_says_both_runs_and_their_difference(tmp_path: Path, capsys: pyt
 
 
 @pytest.mark.parametrize("other", ["nowhere", "another-suite", "other-episodes", "changed-episode"])
-def test_compare_of_what_cannot_be_compared_is_one_line(
+def test_incomparable_runs_are_refused_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], other: str
 ) -> None:
     run_of(tmp_path / "a", [fakes.missed("e1")])

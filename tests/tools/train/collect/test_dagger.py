@@ -145,7 +145,7 @@ def test_new_drives_of_the_expert_come_with_a_round_in_layouts_of_their_own(
 
 
 @pytest.mark.parametrize(("newest_only", "seen"), [(True, ("d2-0", "n2-0")), (False, ("d1-0", "d2-0", "e0", "n2-0"))])
-def test_what_goes_on_learns_from_all_drives_or_from_the_newest_rounds(
+def test_training_after_a_round_uses_all_drives_or_the_newest_rounds(
     tmp_path: Path, newest_only: bool, seen: tuple[str, ...]
 ) -> None:
     job = _job(tmp_path, newest_only=newest_only)

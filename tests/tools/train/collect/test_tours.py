@@ -163,7 +163,7 @@ def test_its_process_writes_a_drive_that_can_be_read_in_seconds(tmp_path: Path) 
         drive.frame(7)
 
 
-def test_seconds_in_which_somebody_is_in_the_way_are_left_out(tmp_path: Path) -> None:
+def test_seconds_with_a_person_in_the_path_are_left_out(tmp_path: Path) -> None:
     def says(motion: str) -> int:
         drive = made_up_drive(f"w{len(motion)}", 40)
         traces = tuple({**trace, "motion": motion if trace["k"] == 10 else "nobody near"} for trace in drive.traces)

@@ -58,7 +58,7 @@ def test_a_setting_may_change_the_network() -> None:
         ("seed=-1", "seed from 0"),
     ],
 )
-def test_a_setting_of_nothing_that_is_there_is_one_clear_line(setting: str, says: str) -> None:
+def test_an_unknown_setting_is_one_clear_line(setting: str, says: str) -> None:
     with pytest.raises(RecipeError, match=says) as caught:
         load_recipe("nano", [setting])
     assert "\n" not in str(caught.value)
@@ -86,7 +86,7 @@ def test_a_wrong_recipe_is_one_clear_line(text: str, says: str, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("name", ["nono", "nowhere.toml", "recipe.json"])
-def test_a_recipe_that_is_not_there_is_said(name: str) -> None:
+def test_a_missing_recipe_is_reported(name: str) -> None:
     with pytest.raises(RecipeError, match=name):
         load_recipe(name)
 

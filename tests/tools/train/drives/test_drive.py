@@ -119,7 +119,7 @@ def test_verifying_finds_one_wrong_byte(tmp_path: Path) -> None:
         Dataset.open(tmp_path, verify=True)
 
 
-def test_a_folder_that_is_no_data_set_says_so(tmp_path: Path) -> None:
+def test_a_folder_that_is_no_data_set_is_refused(tmp_path: Path) -> None:
     with pytest.raises(TrainError, match="record one with collect"):
         Dataset.open(tmp_path)
 
@@ -127,7 +127,7 @@ def test_a_folder_that_is_no_data_set_says_so(tmp_path: Path) -> None:
 # -- writing them -----------------------------------------------------------------------------------------------------
 
 
-def test_a_writer_goes_on_with_what_is_there(tmp_path: Path) -> None:
+def test_a_writer_continues_an_existing_data_set(tmp_path: Path) -> None:
     dataset(tmp_path, drive("e0", frames=20))
     with DatasetWriter(tmp_path) as writer:
         assert writer.has("e0") and not writer.has("e1")

@@ -96,7 +96,7 @@ def test_a_batchs_loss_is_the_mean_of_its_pictures_losses(heads: EncoderHeads) -
         assert alone[0].item() == pytest.approx(together[i].item(), rel=1e-5)
 
 
-def test_what_has_no_colour_no_heading_no_thing_or_no_opening_teaches_nothing_of_it(heads: EncoderHeads) -> None:
+def test_missing_labels_have_no_loss(heads: EncoderHeads) -> None:
     labels = some_labels(2)
     labels["colour"][:], labels["facing"][:], labels["rank"][:], labels["open_kind"][:] = NONE, NONE, 0, 0
     found = costs(heads, labels, tokens(2))
@@ -135,7 +135,7 @@ def with_machine(column: int, count: int = 4) -> dict[str, np.ndarray]:
     return labels
 
 
-def test_whoever_is_right_has_a_full_score() -> None:
+def test_correct_outputs_have_a_full_score() -> None:
     labels = some_labels(30, side=WIDE)
     found = scored(right(labels), labels)
     for name in (

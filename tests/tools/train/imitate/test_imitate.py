@@ -62,7 +62,7 @@ def run_of(dataset: Dataset, job: StageJob) -> Run:
 
 
 @pytest.mark.slow
-def test_it_learns_to_drive_by_what_it_is_told_in_places_it_has_not_seen(tmp_path: Path, dataset: Dataset) -> None:
+def test_it_learns_to_follow_the_semantic_state_in_unseen_layouts(tmp_path: Path, dataset: Dataset) -> None:
     job = imitate_job(tmp_path, LONG)
     _, result = trained(dataset, job)
     lines = list(job.run_dir.lines())

@@ -40,7 +40,7 @@ def test_keeping_the_state_is_driving_on_along_its_arc() -> None:
     assert not plans[3].any()
 
 
-def test_driving_to_waypoints_is_being_there_when_they_say() -> None:
+def test_driving_to_waypoints_arrives_at_their_times() -> None:
     points = np.array([(-0.5, 0.0), (1.0, 1.0), (1.0, 4.0)])
     plan = to_waypoints(points, 4.0, 50)
     # The first one's time, 3 s, is over; the second is to be reached in 2 s, the third in 5 s.
@@ -81,7 +81,7 @@ def test_ages_are_told_apart_and_add_up(samples: Samples) -> None:
         assert each["policy"]["samples"] == count
 
 
-def test_a_policy_loses_by_others_words_what_it_had_by_its_own(samples: Samples) -> None:
+def test_another_drives_states_increase_the_error(samples: Samples) -> None:
     def by_words(batch: ActionBatch) -> torch.Tensor:
         """Goes to the side that it is told; what it is told of its own drive is always right."""
         side = torch.sign(batch.guidance[:, -1, 0]).repeat_interleave(len(batch) // len(batch.guidance))

@@ -186,7 +186,7 @@ TRACE = {
 }
 
 
-def test_words_are_given_to_the_episode_that_they_are_of(tmp_path: Path) -> None:
+def test_an_instruction_belongs_to_its_own_episode(tmp_path: Path) -> None:
     texts = {"1": {"wordings": ["follow the path", "go along the path"], "traces": [TRACE] * 20}}
     first, second = drives(read_scand(_scand(tmp_path / "A", 41.0, texts)), "scand", "spot")
     assert first.wordings == () and first.traces == ()
@@ -207,7 +207,7 @@ def test_words_are_given_to_the_episode_that_they_are_of(tmp_path: Path) -> None
         ({"first": {"wordings": ["go"]}}, "number of an episode"),
     ],
 )
-def test_words_that_cannot_be_are_refused(tmp_path: Path, texts: Mapping[str, Any], says: str) -> None:
+def test_invalid_instructions_are_refused(tmp_path: Path, texts: Mapping[str, Any], says: str) -> None:
     with pytest.raises(TrainError, match=says):
         list(drives(read_scand(_scand(tmp_path / "A", 21.0, texts)), "scand", "spot"))
 
@@ -282,7 +282,7 @@ def test_a_folder_of_recordings_becomes_a_data_set(tmp_path: Path) -> None:
     assert (result["recordings"], result["drives"], result["sha256"]) == (2, 2, found.sha256)
 
 
-def test_the_command_says_in_one_line_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_reports_an_error_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["gnd", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and "found no recording of gnd" in said

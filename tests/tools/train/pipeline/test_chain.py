@@ -85,7 +85,7 @@ def test_all_goes_through_every_stage_with_imitation_again_after_each_round() ->
     assert [step.name for step in steps_of("sft", recipe)] == ["sft"]
 
 
-def test_a_stage_that_was_begun_is_neither_written_over_nor_forgotten(run_dir: RunDir) -> None:
+def test_a_stage_that_was_begun_is_neither_overwritten_nor_skipped(run_dir: RunDir) -> None:
     (run_dir.stage("sft") / "checkpoint").touch()
     with pytest.raises(TrainError, match="--resume"):
         may_begin(run_dir, Step("sft"), resume=False)
@@ -127,9 +127,7 @@ DEAF = ("action.latency_aware", "action.motion_offset")
 
 
 @pytest.mark.parametrize("to", DEAF)
-def test_an_ablation_of_what_is_heard_goes_on_from_weights_that_heard_it(
-    run_dir: RunDir, tmp_path: Path, to: str
-) -> None:
+def test_an_ablation_of_an_input_starts_from_weights_with_that_input(run_dir: RunDir, tmp_path: Path, to: str) -> None:
     save_weights(build(TINY.model, 7), tmp_path / "w.safetensors", WeightsInfo(True, "elsewhere"))
     deaf = replace(TINY, model=with_overrides(TINY.model, {to: "false"}))
     import_start(run_dir.out, deaf.model, [tmp_path / "w.safetensors"], 1)
@@ -178,7 +176,7 @@ def test_a_run_goes_on_from_the_weights_that_a_round_left_elsewhere(
     ("after", "recipe", "says"),
     [("sft", NEWEST, "expected one of imitate, imitate-1"), ("imitate", TINY, "set dagger.newest_only=true")],
 )
-def test_weights_are_adopted_only_where_all_that_follows_is_possible(after: str, recipe: Recipe, says: str) -> None:
+def test_weights_are_adopted_only_where_all_later_steps_are_possible(after: str, recipe: Recipe, says: str) -> None:
     with pytest.raises(TrainError, match=says):
         steps_until(after, recipe, steps_of("all", recipe))
 
@@ -210,7 +208,7 @@ def test_weights_are_exported_once(tmp_path: Path) -> None:
         assert len(asked) == times and f"--checkpoint {weights}" in asked[-1] and "--model nano" in asked[-1]
 
 
-def test_an_export_that_fails_says_its_last_line(tmp_path: Path) -> None:
+def test_a_failed_export_reports_its_last_line(tmp_path: Path) -> None:
     (tmp_path / "w").write_bytes(b"1")
     with pytest.raises(ExportError, match="ended with 1: cosine too low"):
         export_artifacts(
@@ -244,7 +242,7 @@ def test_stages_are_run_one_by_one_into_one_folder(tmp_path: Path, stages: None,
     assert "sft: done before" in capsys.readouterr().err
 
 
-def test_a_dry_run_says_what_would_be_done_and_leaves_nothing(tmp_path: Path, capsys: Any) -> None:
+def test_a_dry_run_prints_the_steps_and_writes_nothing(tmp_path: Path, capsys: Any) -> None:
     assert run("all", "--preset", "tiny", "--out", tmp_path / "run", "--dry-run", "--json", "-") == EXIT_DONE
     told = capsys.readouterr()
     assert "dagger-1" in told.err and "  total " in told.err and not (tmp_path / "run").exists()
@@ -266,7 +264,7 @@ def test_a_dry_run_says_what_would_be_done_and_leaves_nothing(tmp_path: Path, ca
         (("card", "--out", "x"), "the folder of a run"),
     ],
 )
-def test_what_makes_no_sense_is_one_line(
+def test_invalid_arguments_are_refused_in_one_line(
     arguments: tuple[str, ...], says: str, capsys: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -319,7 +317,7 @@ def test_a_stage_that_cannot_go_on_ends_with_its_code_and_a_line(
     assert "Traceback" not in capsys.readouterr().err and RunDir(tmp_path / "run").result("sft") is None
 
 
-def test_a_bug_is_not_dressed_up_as_bad_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bug_is_not_reported_as_bad_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     use(monkeypatch, raising(ValueError("shapes do not match")))
     with pytest.raises(ValueError, match="shapes"):
         run("sft", "--preset", "tiny", "--out", tmp_path / "run")
@@ -349,7 +347,7 @@ def trained(run_dir: RunDir) -> RunDir:
     return run_dir
 
 
-def test_the_card_says_what_it_is_made_of_and_how_well_it_does(trained: RunDir, tmp_path: Path) -> None:
+def test_the_card_names_its_data_and_its_scores(trained: RunDir, tmp_path: Path) -> None:
     scores = tmp_path / "result.json"
     conditions = {"clock": "lockstep", "mode": "async", "drift": "none"}
     latency = {"profile": "2 s"}
@@ -364,7 +362,7 @@ def test_the_card_says_what_it_is_made_of_and_how_well_it_does(trained: RunDir, 
     assert card(trained, TINY, trained.model_path) == card(trained, TINY, trained.model_path)
 
 
-def test_scores_of_something_else_are_refused(trained: RunDir, tmp_path: Path) -> None:
+def test_scores_of_other_weights_are_refused(trained: RunDir, tmp_path: Path) -> None:
     (tmp_path / "other.json").write_text("{}")
     with pytest.raises(TrainError, match=r"result.json of edge-bench"):
         write_card(trained, TINY, [tmp_path / "other.json"])
@@ -381,9 +379,7 @@ def test_weights_that_are_given_away_are_half_the_size_and_the_default_of_their_
 
 
 @pytest.mark.parametrize("text", [None, b"# Somebody's weights", b"\xff\xfe"])
-def test_weights_without_a_card_of_their_own_are_those_of_others(
-    run_dir: RunDir, tmp_path: Path, text: bytes | None
-) -> None:
+def test_weights_without_a_card_are_foreign(run_dir: RunDir, tmp_path: Path, text: bytes | None) -> None:
     if text is not None:
         (tmp_path / "w.md").write_bytes(text)
     adopted(run_dir, tmp_path, "imitate")

@@ -106,7 +106,7 @@ def test_a_plan_with_their_drives_collects_nothing(theirs: Dataset, capsys: pyte
         (("sft",), "not the index of a data set"),
     ],
 )
-def test_what_makes_no_sense_is_one_line(
+def test_invalid_arguments_are_refused_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], says: str
 ) -> None:
     out = tmp_path / "c"
