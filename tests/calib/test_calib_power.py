@@ -32,13 +32,7 @@ from export.targets.file import for_model, list_targets, load_target, parse_targ
 TREES = Path(__file__).parents[1] / "data/sysfs"
 SECOND = 1_000_000_000
 IDLE_W = 5.0
-TRUE_J = {
-    "vision_encoder": 1.5,
-    "action_expert": 0.05,
-    "prefill": 4.0,
-    "decode": 0.2,
-    "semantic_context": 0.04,
-}
+TRUE_J = {"vision_encoder": 1.5, "action_expert": 0.05, "prefill": 4.0, "decode": 0.2, "semantic_context": 0.04}
 MIXTURES: dict[str, dict[str, float]] = {
     "idle": {},
     "vision_encoder": {"vision_encoder": 200},

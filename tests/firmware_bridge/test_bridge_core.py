@@ -168,12 +168,7 @@ class TestArmed:
         bench.wait(20)
         assert bench.moves()[-1].vx_mps == pytest.approx(-LIMITS.accel_mps2 / BRIDGE.rate_hz)
 
-    @given(
-        st.lists(
-            st.tuples(*[st.floats(allow_nan=True, allow_infinity=True)] * 3, st.integers(0, 120)),
-            max_size=30,
-        )
-    )
+    @given(st.lists(st.tuples(*[st.floats(allow_nan=True, allow_infinity=True)] * 3, st.integers(0, 120)), max_size=30))
     def test_every_command_stays_within_limits_and_slew(self, commands: list) -> None:
         bench = Bench().arm()
         for vx, vy, wz, ms in commands:

@@ -36,10 +36,10 @@ class TestOperator:
         bench.permit().arm()
 
     def test_a_stop_beside_an_arm_in_one_step_stops_and_holds(self) -> None:
-        for said in ((Stop(), Arm()), (Arm(), Stop()), (Stop(), Arm(), Arm())):
+        for message in ((Stop(), Arm()), (Arm(), Stop()), (Stop(), Arm(), Arm())):
             bench = Bench().arm()
             bench.drive(500)
-            bench.step(operator=said)
+            bench.step(operator=message)
             assert (bench.status.state, bench.status.blocked_by) == ("stopped", "estop")
             assert bench.moves()[-1] == ZERO
 

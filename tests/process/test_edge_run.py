@@ -224,7 +224,7 @@ def test_artifacts_that_do_not_verify_are_refused_by_name(tmp_path: Path, artifa
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (("--instruction", " "), "instruction is empty"),
         (("--duration", "-3"), "--duration"),
@@ -235,8 +235,8 @@ def test_artifacts_that_do_not_verify_are_refused_by_name(tmp_path: Path, artifa
         (("--record", "no-such-folder/flight.mcap"), "no-such-folder"),
     ],
 )
-def test_bad_input_gets_one_line_and_exit_code_2(tmp_path: Path, change: tuple[str, str], said: str) -> None:
+def test_bad_input_gets_one_line_and_exit_code_2(tmp_path: Path, change: tuple[str, str], message: str) -> None:
     done = run(*Robot(tmp_path, 1, tmp_path).arguments(*change))
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
-    assert said in done.stderr
+    assert message in done.stderr

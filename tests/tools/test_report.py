@@ -367,7 +367,7 @@ def _frames_that_are_no_pictures(data: Any) -> Callable[[Path], None]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("spoil", "said"),
+    ("spoil", "message"),
     [
         (_append_bytes("hil_trace.jsonl", b"\xff\xfe\n"), "hil_trace.jsonl cannot be read as UTF-8"),
         (_append_bytes("hil_trace.jsonl", b'{"kind": "pose", "t_ns": 1}\n'), "hil_trace.jsonl: a record lacks"),
@@ -382,14 +382,14 @@ def _frames_that_are_no_pictures(data: Any) -> Callable[[Path], None]:
     ],
 )
 def test_a_damaged_file_is_one_line_and_leaves_the_old_report(
-    tmp_path: Path, spoil: Callable[[Path], None], said: str, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, spoil: Callable[[Path], None], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     synthetic_run.write_run(tmp_path, 6.0)
     (tmp_path / "report.html").write_text("the old one")
     spoil(tmp_path)
     assert demo_report.main([str(tmp_path)]) == 2
     error = capsys.readouterr().err
-    assert said in error and error.count("\n") == 1
+    assert message in error and error.count("\n") == 1
     assert (tmp_path / "report.html").read_text() == "the old one"
 
 

@@ -7,14 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from edge.core.device import (
-    OPENVINO,
-    TENSORRT,
-    DeviceError,
-    check_power_mode,
-    l4t_release,
-    read_device,
-)
+from edge.core.device import OPENVINO, TENSORRT, DeviceError, check_power_mode, l4t_release, read_device
 
 CONF = """
 < POWER_MODEL ID=0 NAME=MAXN_SUPER >

@@ -46,10 +46,7 @@ def test_a_profile_names_the_provider_of_every_node() -> None:
         event("a", CUDA, "MatMul", duration_us=7),
         event("b", CPU_PROVIDER, "Shape", size=16),
     ]
-    assert placements(events) == [
-        Placement(CPU_PROVIDER, "Shape", 1, 16, 10),
-        Placement(CUDA, "MatMul", 1, 4096, 12),
-    ]
+    assert placements(events) == [Placement(CPU_PROVIDER, "Shape", 1, 16, 10), Placement(CUDA, "MatMul", 1, 4096, 12)]
 
 
 @pytest.mark.parametrize("events", [[], [{"cat": "Node", "name": "a_kernel_time", "args": {}}], ["text"]])

@@ -81,8 +81,7 @@ def test_a_list_of_cores_is_read(text: str, cores: set[int]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("governors", "level"),
-    [(["performance"], Level.OK), (["performance", "schedutil"], Level.WARN), ([], Level.SKIP)],
+    ("governors", "level"), [(["performance"], Level.OK), (["performance", "schedutil"], Level.WARN), ([], Level.SKIP)]
 )
 def test_a_governor_that_follows_the_load_is_a_warning(tmp_path: Path, governors: list[str], level: Level) -> None:
     cpu = "sys/devices/system/cpu"

@@ -127,11 +127,7 @@ AT_HOME = (Path("/home/me/odometry.json"),)
         (runner_unit, {}, {"PrivateDevices": ["yes"], "MemoryDenyWriteExecute": ["yes"]}),
         (runner_unit, {"memory_bytes": None}, {"MemoryMax": ["75%"]}),
         (bridge_unit, {"bridge_cores": (6, 7)}, {"CPUAffinity": ["6 7"]}),
-        (
-            bridge_unit,
-            {"systemd": 254},
-            {"RestartSec": ["100ms"], "RestartSteps": ["5"], "RestartMaxDelaySec": ["5s"]},
-        ),
+        (bridge_unit, {"systemd": 254}, {"RestartSec": ["100ms"], "RestartSteps": ["5"], "RestartMaxDelaySec": ["5s"]}),
         (bridge_unit, {"robot_files": AT_HOME}, {"BindReadOnlyPaths": ['"/home/me/odometry.json"']}),
         (runner_unit, {"robot_files": AT_HOME}, {"BindReadOnlyPaths": ['"/home/me/odometry.json"']}),
         (

@@ -15,10 +15,7 @@ import pytest
 
 from edge.artifacts.manifest import Artifacts, load_artifacts
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_REFUSED
-from edge.core.device import (
-    TENSORRT,
-    DeviceFacts,
-)
+from edge.core.device import TENSORRT, DeviceFacts
 from edge.deploy.install import main
 from edge.inference.engines import (
     ENGINES_NAME,

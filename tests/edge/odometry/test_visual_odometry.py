@@ -83,9 +83,11 @@ def test_a_nod_that_the_robot_reports_is_no_motion() -> None:
 
 @pytest.mark.slow
 def test_a_larger_camera_pitch_than_configured_is_estimated_gradually() -> None:
-    told = GEOMETRY
-    real = CameraGeometry(told.hfov_rad, told.height_m, told.pitch_rad + math.radians(0.4), told.forward_m)
-    eye = VisualOdometry(told)
+    configured = GEOMETRY
+    real = CameraGeometry(
+        configured.hfov_rad, configured.height_m, configured.pitch_rad + math.radians(0.4), configured.forward_m
+    )
+    eye = VisualOdometry(configured)
     for index, pose in enumerate(along(SE2(0.06, 0.0, 0.0), 50)):
         eye.step(picture(TEXTURE, pose, geometry=real), FRAME_NS * index, Attitude())
     assert 0.1 < math.degrees(eye.tilt_rad) < 0.5

@@ -26,10 +26,7 @@ class Desk:
             ),
         )
         self.pre_arm = PreArm(
-            watch,
-            picture=lambda: self.bench.frame,
-            pose=self.bench.history.newest,
-            clock=lambda: self.bench.now_ns,
+            watch, picture=lambda: self.bench.frame, pose=self.bench.history.newest, clock=lambda: self.bench.now_ns
         )
         self.camera = self.robot = True
 

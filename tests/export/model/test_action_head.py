@@ -17,14 +17,7 @@ from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 from export.checkpoint.load import load_checkpoint
 from export.model.action import ActionExpert
 from export.model.config import PRESETS, ModelConfigError, config_from_dict
-from export.model.heads import (
-    ActionScale,
-    Diffusion,
-    cosine_schedule,
-    ddim_steps,
-    differentiated,
-    integrated,
-)
+from export.model.heads import ActionScale, Diffusion, cosine_schedule, ddim_steps, differentiated, integrated
 from export.model.network import build
 from export.model.weights import CheckpointError, WeightsInfo, save_weights, weights_sha256
 from tests.support.export.action_heads import HEADS, TINY, drives, expert, instants, lively, normal, states, with_head

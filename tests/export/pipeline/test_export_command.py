@@ -34,11 +34,7 @@ def test_an_interrupt_while_modules_load_is_no_traceback(
     ("arguments", "kept"), [([], "finished stages are in the cache"), (["--no-cache"], "nothing was kept")]
 )
 def test_an_interrupt_names_the_remaining_parts(
-    arguments: list[str],
-    kept: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str], kept: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt

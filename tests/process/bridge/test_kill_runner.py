@@ -15,15 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.processes import (
-    GO2_SIM,
-    HostStall,
-    check_stop_latency,
-    hil_arguments,
-    read_trace,
-    running,
-    wait_for,
-)
+from tests.support.processes import GO2_SIM, HostStall, check_stop_latency, hil_arguments, read_trace, running, wait_for
 from tools.bench.stop import received_moves
 
 pytestmark = pytest.mark.process

@@ -70,10 +70,6 @@ def test_a_lying_robot_stands_up_locked_and_only_then_balances(simulation: Simul
     assert truth.accel_mps2 == pytest.approx((0, 0, 9.81), abs=0.4)
 
 
-def test_balance_stand_is_refused_while_lying(simulation: Simulation) -> None:
-    assert simulation.sport(SportAction.BALANCE_STAND) == ERROR_NOT_STANDING
-
-
 @pytest.mark.parametrize("prepare", [(), (SportAction.STAND_UP,), (SportAction.DAMP,)])
 def test_move_has_no_effect_unless_balanced(simulation: Simulation, prepare: tuple[SportAction, ...]) -> None:
     for action in prepare:

@@ -57,7 +57,7 @@ def test_an_artifact_directory_means_the_same_in_a_worker_elsewhere() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         (("--policy", "clever"), "expected artifacts:DIR, external:ADDR"),
         (("--policy", "artifacts:"), "expected artifacts:DIR"),
@@ -79,8 +79,8 @@ def test_an_artifact_directory_means_the_same_in_a_worker_elsewhere() -> None:
         (("--policy", "external:h:1", "--external-timeout", "0"), "external timeout"),
     ],
 )
-def test_contradictory_conditions_are_refused_in_one_line(arguments: tuple[str, ...], says: str) -> None:
-    with pytest.raises(ConditionsError, match=says) as caught:
+def test_contradictory_conditions_are_refused_in_one_line(arguments: tuple[str, ...], message: str) -> None:
+    with pytest.raises(ConditionsError, match=message) as caught:
         asked(*arguments)
     assert "\n" not in str(caught.value)
 

@@ -51,7 +51,7 @@ def test_a_profile_survives_json(times: list[float]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changed", "says"),
+    ("changed", "message"),
     [
         ({"schema": 2}, "schema = 1"),
         ({"generation_s": []}, "1 to 100000 generation times, found 0"),
@@ -65,10 +65,10 @@ def test_a_profile_survives_json(times: list[float]) -> None:
         ({"unit": "s"}, "unknown key 'unit'"),
     ],
 )
-def test_a_wrong_profile_is_one_clear_line(tmp_path: Path, changed: dict[str, Any], says: str) -> None:
+def test_a_wrong_profile_is_one_clear_line(tmp_path: Path, changed: dict[str, Any], message: str) -> None:
     path = tmp_path / "profile.json"
     path.write_text(json.dumps(profile(**changed)))
-    with pytest.raises(LatencyError, match=says) as caught:
+    with pytest.raises(LatencyError, match=message) as caught:
         parse_latency(f"profile:{path}")
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 

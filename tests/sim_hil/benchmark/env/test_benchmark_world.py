@@ -77,8 +77,8 @@ def test_path_and_time_are_those_driven(reached: EpisodeWorld) -> None:
 
 def test_without_drift_odometry_equals_the_true_path(reached: EpisodeWorld) -> None:
     start = SE2(*reached.trajectory()[0])
-    told, true = reached.observe().T_odom_base, start.inverse() @ reached.pose()
-    assert told.as_tuple() == pytest.approx(true.as_tuple(), abs=1e-6)
+    reported, true = reached.observe().T_odom_base, start.inverse() @ reached.pose()
+    assert reported.as_tuple() == pytest.approx(true.as_tuple(), abs=1e-6)
     assert reached.observe().state[0] == pytest.approx(0.8, abs=0.15)
 
 

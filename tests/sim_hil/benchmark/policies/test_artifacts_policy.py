@@ -66,10 +66,10 @@ def test_it_stands_until_the_first_latency_is_over_and_drives_from_then_on(
 
 def test_the_model_receives_the_delay_and_motion_of_virtual_time(policies: dict[str, ArtifactsPolicy]) -> None:
     rows = drive(policies["async"], 12)
-    told = [
+    inputs = [
         (round(notes["delay_s"], 3), round(notes["offset"][0], 3)) for _, notes in rows if notes["delay_s"] is not None
     ]
-    assert told[:6] == [(0.5, 0.25), (0.6, 0.3), (0.7, 0.35), (0.8, 0.4), (0.9, 0.45), (0.5, 0.25)]
+    assert inputs[:6] == [(0.5, 0.25), (0.6, 0.3), (0.7, 0.35), (0.8, 0.4), (0.9, 0.45), (0.5, 0.25)]
 
 
 def test_odometry_that_reports_another_motion_changes_the_motion_offset(policies: dict[str, ArtifactsPolicy]) -> None:
@@ -110,8 +110,8 @@ def test_without_reasoning_it_drives_without_a_text(policies: dict[str, Artifact
 def test_generations_have_times_of_the_episode(policies: dict[str, ArtifactsPolicy]) -> None:
     policy = policies["async"]
     drive(policy, 12)
-    told = [(r["started_s"], r["anchor_s"], r["released_s"]) for r in policy.generations()]
-    assert told == [(0.0, 0.0, 0.5), (0.5, 0.5, 1.0)]
+    inputs = [(r["started_s"], r["anchor_s"], r["released_s"]) for r in policy.generations()]
+    assert inputs == [(0.0, 0.0, 0.5), (0.5, 0.5, 1.0)]
 
 
 def test_an_instruction_that_does_not_fit_the_model_is_refused(policies: dict[str, ArtifactsPolicy]) -> None:

@@ -196,11 +196,6 @@ def test_it_keeps_to_the_prescribed_route_where_another_is_shorter() -> None:
     assert np.hypot(*(route[-1] - np.array(GOAL))) < 0.2
 
 
-def test_a_prescribed_route_that_is_the_shorter_one_changes_nothing_much() -> None:
-    points = (START, (-1.0, -1.8), (1.0, -1.8), GOAL)
-    assert len(_prescribed(points)) == pytest.approx(len(_prescribed(())), abs=3)
-
-
 def test_it_drives_at_the_speed_it_is_given_and_reports_its_choice() -> None:
     episode = corridor_episode(robot="carter", timeout_s=2.5)
     teacher = ExpertPolicy(margin_m=0.1, speed_mps=0.5)

@@ -133,15 +133,15 @@ def test_an_address_that_is_none_is_refused(text: str) -> None:
 
 
 def test_its_request_has_the_robots_inputs_and_not_the_goal(tmp_path: Path) -> None:
-    told: list[Message] = []
+    requests: list[Message] = []
 
     def act(message: Message) -> Answer:
-        told.append(message)
+        requests.append(message)
         return {"type": "act", "step": message.header["step"], "velocity": [0.5, 0.0, 0.1], "text": "ahead"}
 
     def answer(message: Message, channel: Channel) -> Answer:
         if message.kind == "reset":
-            told.append(message)
+            requests.append(message)
         return polite(act)(message, channel)
 
     with serving(tmp_path, answer) as address:
@@ -150,20 +150,20 @@ def test_its_request_has_the_robots_inputs_and_not_the_goal(tmp_path: Path) -> N
         assert policy.act(observation(0.0)) == (0.5, 0.0, 0.1)
         assert policy.notes() == {"text": "ahead", "waypoints": None, "delay_s": 0.0, "clipped": 0}
         policy.close()
-    reset, observe = told
+    reset, observe = requests
     assert set(reset.header) == {
         "type", "episode", "robot", "instruction", "seed", "control_period_s", "limits",
     } and reset.header["instruction"] == "go on"  # fmt: skip
     assert observe.header["state"] == [0.1, 0.0, 0.2] and observe.header["pose"] == [1.0, 2.0, 0.3]
-    assert "goal" not in json.dumps([message.header for message in told])
+    assert "goal" not in json.dumps([message.header for message in requests])
 
 
 def test_its_request_does_not_identify_the_episode(tmp_path: Path) -> None:
-    told: list[Mapping[str, Any]] = []
+    requests: list[Mapping[str, Any]] = []
 
     def answer(message: Message, channel: Channel) -> Answer:
         if message.kind == "reset":
-            told.append(message.header)
+            requests.append(message.header)
         return driving([0.0, 0.0, 0.0])(message, channel)
 
     with serving(tmp_path, answer) as address:
@@ -171,9 +171,9 @@ def test_its_request_does_not_identify_the_episode(tmp_path: Path) -> None:
         for name, seed in (("hospital-reception-20-go2", 10022), ("office-desk-0-go2", 10022)) * 2:
             policy.reset(fakes.episode(name, seed=seed), "go on", None, seed)
         policy.close()
-    first, second, again, _ = told
+    first, second, again, _ = requests
     assert first == again and first["episode"] != second["episode"] and first["seed"] != second["seed"]
-    said = json.dumps(told)
+    said = json.dumps(requests)
     assert "reception" not in said and "desk" not in said and "10022" not in said
 
 

@@ -135,8 +135,8 @@ def run_of(folder: Path, results: list[fakes.EpisodeResult], suite: str = "dynan
 def test_compare_prints_both_runs_and_their_difference(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     a, b = run_of(tmp_path / "a", [fakes.missed("e1"), fakes.missed("e3")]), run_of(tmp_path / "b", mixed(4))
     assert cli.main(["compare", str(a), str(b)]) == 0
-    said = capsys.readouterr().out
-    assert "2 episodes in both" in said and "+100.00" in said and "succeeded in B only: e1, e3" in said
+    message = capsys.readouterr().out
+    assert "2 episodes in both" in message and "+100.00" in message and "succeeded in B only: e1, e3" in message
 
 
 @pytest.mark.parametrize("other", ["nowhere", "another-suite", "other-episodes", "changed-episode"])
@@ -148,8 +148,8 @@ def test_incomparable_runs_are_refused_in_one_line(
     run_of(tmp_path / "other-episodes", [fakes.missed("e2")])
     run_of(tmp_path / "changed-episode", [fakes.missed("e1", timeout_s=55.0)])
     assert cli.main(["compare", str(tmp_path / "a"), str(tmp_path / other)]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("edge-bench compare: ") and said.count("\n") == 1
+    message = capsys.readouterr().err
+    assert message.startswith("edge-bench compare: ") and message.count("\n") == 1
 
 
 def test_a_report_that_is_written_again_still_names_the_episodes_without_a_result(tmp_path: Path) -> None:

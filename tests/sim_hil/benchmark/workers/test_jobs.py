@@ -74,13 +74,15 @@ def test_an_attempt_that_ends_without_a_result_is_run_again_once(tmp_path: Path)
 
 
 def test_an_episode_whose_process_always_dies_is_a_failed_run_and_in_no_rate(tmp_path: Path) -> None:
-    store, told = store_in(tmp_path), []
-    run_all(tasks_in(store, "a", "b"), Scripted(1, a=["dies", "dies"]), store, watcher=RunWatcher(failed=told.append))
+    store, failures = store_in(tmp_path), []
+    run_all(
+        tasks_in(store, "a", "b"), Scripted(1, a=["dies", "dies"]), store, watcher=RunWatcher(failed=failures.append)
+    )
     assert [r.id for r in store.results] == ["b"]
     assert (
         [(f.id, f.attempts, f.why) for f in store.failed]
         == [("a", 2, "died")]
-        == [(f.id, f.attempts, f.why) for f in told]
+        == [(f.id, f.attempts, f.why) for f in failures]
     )
 
 

@@ -182,13 +182,13 @@ def test_a_real_drive_is_made_of_a_training_scenario_and_is_the_same_in_any_proc
     with DatasetWriter(tmp_path / "here") as here, DatasetWriter(tmp_path / "process") as there:
         order = Order(str(here.folder), "e", 7, 3, 0, 1, (), config)
         begun, made = list(messages(plain(order)))
-        workers, told = collection.Workers(collection.WORKER, 1), []
+        workers, received = collection.Workers(collection.WORKER, 1), []
         workers.start("e", plain(replace(order, folder=str(there.folder))), tmp_path / "e.log")
         while workers.running():
-            told += [each.message for each in workers.wait(1.0)]
+            received += [each.message for each in workers.wait(1.0)]
         workers.close()
         drive = Drive.load(here.path("e00000"))
-    assert begun == {"begun": "e00000"} and told == [begun, dict(made), None]
+    assert begun == {"begun": "e00000"} and received == [begun, dict(made), None]
     assert drive.about.kind == "corridor" and drive.about.outcome == "reached" and drive.about.driver == "expert"
     assert len(drive.wordings) >= 8 and not any(is_held_out(text) for text in drive.wordings)
     assert len(drive.traces) == (len(drive) - 1) // 10 + 1

@@ -84,11 +84,11 @@ def test_in_the_experts_stretches_the_policy_goes_on_seeing(
     monkeypatch.setattr(ArtifactsPolicy, "act", watched)
     image = np.full((128, 128, 3), 90, np.uint8)
     with PolicyDriver(_options(artifacts, 1.0), corridor_episode(), np.random.default_rng(1)) as policy:
-        told = [
+        inputs = [
             policy.steer(Observation(tick / 10, image, (0.0, 0.0, 0.0), SE2(0.0, 0.0, 0.0), False, False), wanted)
             for tick in range(5)
         ]
-    assert told == [(wanted, EXPERT)] * 5 and seen == [0.0, 0.1, 0.2, 0.3, 0.4]
+    assert inputs == [(wanted, EXPERT)] * 5 and seen == [0.0, 0.1, 0.2, 0.3, 0.4]
 
 
 def test_other_artifacts_than_the_rounds_are_refused(artifacts: Artifacts) -> None:

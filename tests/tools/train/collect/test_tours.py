@@ -167,8 +167,8 @@ def test_seconds_with_a_person_in_the_path_are_left_out(tmp_path: Path) -> None:
     def says(motion: str) -> int:
         drive = made_up_drive(f"w{len(motion)}", 40)
         traces = tuple({**trace, "motion": motion if trace["k"] == 10 else "nobody near"} for trace in drive.traces)
-        told = replace(drive, about=replace(drive.about, traces=traces))
-        dataset = write_dataset(tmp_path / f"{len(motion)}", [told])
+        relabelled = replace(drive, about=replace(drive.about, traces=traces))
+        dataset = write_dataset(tmp_path / f"{len(motion)}", [relabelled])
         return sum(anchor.k == 10 for anchor in tour_anchors(dataset, dataset.ids))
 
     assert says("person ahead 2 m coming") == says("person left 1 m standing, person ahead 1 m leaving") == 0

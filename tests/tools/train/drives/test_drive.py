@@ -43,7 +43,7 @@ def test_without_its_pictures_everything_else_is_there(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "says"),
+    ("name", "value", "message"),
     [
         ("pose", np.zeros((59, 3)), "pose: expected"),
         ("state", np.zeros((60, 3)), "state: expected float32"),
@@ -52,8 +52,8 @@ def test_without_its_pictures_everything_else_is_there(tmp_path: Path) -> None:
         ("future_steps", np.full(60, 51, np.int16), "0 to 50"),
     ],
 )
-def test_arrays_that_cannot_be_are_refused(name: str, value: np.ndarray, says: str) -> None:
-    with pytest.raises(TrainError, match=says):
+def test_arrays_that_cannot_be_are_refused(name: str, value: np.ndarray, message: str) -> None:
+    with pytest.raises(TrainError, match=message):
         replace(drive(), **{name: value})
 
 

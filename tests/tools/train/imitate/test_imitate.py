@@ -21,11 +21,7 @@ from tools.train.config.imitate import POINT_GOAL, ImitateConfig, ImitateEvalCon
 from tools.train.drives.drive import Dataset
 from tools.train.imitate.data import NoStates
 from tools.train.imitate.imitate import POINT_GOAL_FILE, fit, run
-from tools.train.imitate.trainable_policies import (
-    PointGoalNetPolicy,
-    build_point_goal,
-    load_point_goal,
-)
+from tools.train.imitate.trainable_policies import PointGoalNetPolicy, build_point_goal, load_point_goal
 from tools.train.pipeline.chain import Step, run_step
 from tools.train.run import distributed
 from tools.train.run.job import StageJob

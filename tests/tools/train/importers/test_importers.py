@@ -196,7 +196,7 @@ def test_an_instruction_belongs_to_its_own_episode(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("texts", "says"),
+    ("texts", "message"),
     [
         ({"7": {"wordings": ["go"]}}, "texts for episode 7; expected a number below 1"),
         ({"0": {"wordings": ["go"], "traces": [TRACE]}}, "expected 20 traces"),
@@ -207,8 +207,8 @@ def test_an_instruction_belongs_to_its_own_episode(tmp_path: Path) -> None:
         ({"first": {"wordings": ["go"]}}, "number of an episode"),
     ],
 )
-def test_invalid_instructions_are_refused(tmp_path: Path, texts: Mapping[str, Any], says: str) -> None:
-    with pytest.raises(TrainError, match=says):
+def test_invalid_instructions_are_refused(tmp_path: Path, texts: Mapping[str, Any], message: str) -> None:
+    with pytest.raises(TrainError, match=message):
         list(drives(read_scand(_scand(tmp_path / "A", 21.0, texts)), "scand", "spot"))
 
 
@@ -216,16 +216,16 @@ def test_invalid_instructions_are_refused(tmp_path: Path, texts: Mapping[str, An
 
 
 @pytest.mark.parametrize(
-    ("rows", "says"),
+    ("rows", "message"),
     [
         ("stamp_ns,x_m,y_m\n1,2,3\n", "column theta_rad is missing"),
         ("stamp_ns,x_m,y_m,theta_rad\n1,2,north,3\n", "not of numbers"),
     ],
 )
-def test_odometry_that_cannot_be_is_refused(tmp_path: Path, rows: str, says: str) -> None:
+def test_odometry_that_cannot_be_is_refused(tmp_path: Path, rows: str, message: str) -> None:
     folder = _scand(tmp_path / "A", 1.0)
     (folder / "odometry.csv").write_text(rows)
-    with pytest.raises(TrainError, match=says):
+    with pytest.raises(TrainError, match=message):
         read_scand(folder)
 
 

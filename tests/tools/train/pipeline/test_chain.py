@@ -173,23 +173,23 @@ def test_a_run_goes_on_from_the_weights_that_a_round_left_elsewhere(
 
 
 @pytest.mark.parametrize(
-    ("after", "recipe", "says"),
+    ("after", "recipe", "message"),
     [("sft", NEWEST, "expected one of imitate, imitate-1"), ("imitate", TINY, "set dagger.newest_only=true")],
 )
-def test_weights_are_adopted_only_where_all_later_steps_are_possible(after: str, recipe: Recipe, says: str) -> None:
-    with pytest.raises(TrainError, match=says):
+def test_weights_are_adopted_only_where_all_later_steps_are_possible(after: str, recipe: Recipe, message: str) -> None:
+    with pytest.raises(TrainError, match=message):
         steps_until(after, recipe, steps_of("all", recipe))
 
 
 # Export in between
 
 
-def command(tmp_path: Path, code: int, says: str = "") -> list[str]:
+def command(tmp_path: Path, code: int, message: str = "") -> list[str]:
     """An `edge-export` that writes down what it is asked, and ends."""
     script = tmp_path / "export.sh"
     lines = (
         f'echo "$@" >> {tmp_path}/asked',
-        f'echo "{says}"',
+        f'echo "{message}"',
         'mkdir -p "${@: -1}"',
         'touch "${@: -1}/manifest.json"',
         f"exit {code}",
@@ -244,13 +244,13 @@ def test_stages_are_run_one_by_one_into_one_folder(tmp_path: Path, stages: None,
 
 def test_a_dry_run_prints_the_steps_and_writes_nothing(tmp_path: Path, capsys: Any) -> None:
     assert run("all", "--preset", "tiny", "--out", tmp_path / "run", "--dry-run", "--json", "-") == EXIT_DONE
-    told = capsys.readouterr()
-    assert "dagger-1" in told.err and "  total " in told.err and not (tmp_path / "run").exists()
-    assert json.loads(told.out)["budget"]
+    printed = capsys.readouterr()
+    assert "dagger-1" in printed.err and "  total " in printed.err and not (tmp_path / "run").exists()
+    assert json.loads(printed.out)["budget"]
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         (("sft",), "--out is missing"),
         (("sft", "--preset", "nono", "--out", "x"), "expected one of 1b, nano, tiny"),
@@ -265,12 +265,12 @@ def test_a_dry_run_prints_the_steps_and_writes_nothing(tmp_path: Path, capsys: A
     ],
 )
 def test_invalid_arguments_are_refused_in_one_line(
-    arguments: tuple[str, ...], says: str, capsys: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    arguments: tuple[str, ...], message: str, capsys: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert run(*arguments) == EXIT_BAD_INPUT
-    told = capsys.readouterr().err
-    assert says in told and told.count("\n") == 1 and not list(tmp_path.iterdir())
+    printed = capsys.readouterr().err
+    assert message in printed and printed.count("\n") == 1 and not list(tmp_path.iterdir())
 
 
 def test_a_run_keeps_its_own_copy_of_a_devices_delays(

@@ -19,14 +19,7 @@ from export.model.config import PRESETS
 from tools.train.config.checks import OptimConfig, TrainError
 from tools.train.config.recipe import load_recipe
 from tools.train.run.distributed import autocast, computes_bf16
-from tools.train.run.loop import (
-    Optimiser,
-    learning_rate,
-    load_checkpoint,
-    save_checkpoint,
-    under,
-    with_prefix,
-)
+from tools.train.run.loop import Optimiser, learning_rate, load_checkpoint, save_checkpoint, under, with_prefix
 from tools.train.run.run_dir import RunDir
 
 NANO = PRESETS["nano"]

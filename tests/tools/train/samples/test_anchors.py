@@ -174,10 +174,10 @@ def test_wrong_progress_has_the_given_share_and_is_always_wrong(anchors: dict[in
 def test_past_motion_matches_that_of_another_odometry_origin(anchors: dict[int, Anchor]) -> None:
     config, rng = DrawConfig(way_point_m=0.0), np.random.default_rng(0)
     recorded = np.array(anchors[100].way)
-    told = np.array([draw(anchors[100], config, rng).way for _ in range(400)])
-    assert np.allclose(told, np.round(told, 1))
-    assert np.hypot(*(told - recorded).T).max() < 0.15 * np.hypot(*recorded.T).max() + 0.1
-    assert np.allclose(told.mean(0), recorded, atol=0.1) and told.std(0).max() > 0.02
+    paths = np.array([draw(anchors[100], config, rng).way for _ in range(400)])
+    assert np.allclose(paths, np.round(paths, 1))
+    assert np.hypot(*(paths - recorded).T).max() < 0.15 * np.hypot(*recorded.T).max() + 0.1
+    assert np.allclose(paths.mean(0), recorded, atol=0.1) and paths.std(0).max() > 0.02
     exact = DrawConfig(way_turn_rad=0.0, way_scale=0.0, way_point_m=0.0)
     assert draw(anchors[100], exact, rng).way == anchors[100].way
 
