@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 
@@ -37,31 +38,12 @@ def _operator(bench: Bench) -> None:
     bench.step(operator=(Stop(),))
 
 
-def _tipped(bench: Bench) -> None:
-    bench.robot = {"pitch_rad": math.radians(31)}
-    bench.step()
+def _robot_reports(**state: float) -> Callable[[Bench], None]:
+    def danger(bench: Bench) -> None:
+        bench.robot = state
+        bench.step()
 
-
-def _rolled(bench: Bench) -> None:
-    bench.robot = {"roll_rad": math.radians(-31)}
-    bench.step()
-
-
-def _error(bench: Bench) -> None:
-    bench.robot = {"error_code": 17}
-    bench.step()
-
-
-def _writes_fail(bench: Bench) -> None:
-    bench.step(writes_fail=True)
-
-
-def _denied(bench: Bench) -> None:
-    bench.step(denied="StopMove")
-
-
-def _second_publisher(bench: Bench) -> None:
-    bench.step(publishers="2 publishers of rt/sportmodestate")
+    return danger
 
 
 DANGERS = [
@@ -70,12 +52,12 @@ DANGERS = [
     (_remote_estop, "estop"),
     (_local_estop, "estop"),
     (_operator, "estop"),
-    (_tipped, "tipped"),
-    (_rolled, "tipped"),
-    (_error, "robot_error"),
-    (_writes_fail, "link_down"),
-    (_denied, "second_commander"),
-    (_second_publisher, "second_publisher"),
+    (_robot_reports(pitch_rad=math.radians(31)), "tipped"),
+    (_robot_reports(roll_rad=math.radians(-31)), "tipped"),
+    (_robot_reports(error_code=17), "robot_error"),
+    (lambda bench: bench.step(writes_fail=True), "link_down"),
+    (lambda bench: bench.step(denied="StopMove"), "second_commander"),
+    (lambda bench: bench.step(publishers="2 publishers of rt/sportmodestate"), "second_publisher"),
 ]
 LATCHING = (_remote_estop, _local_estop, _operator)
 
@@ -162,7 +144,7 @@ class TestBattery:
         bench.wait(200)
         assert bench.status.blocked_by == "battery_low"
 
-    def test_a_robot_file_that_asks_for_no_charge_needs_no_report(self) -> None:
+    def test_a_robot_file_without_a_minimum_charge_needs_no_battery_report(self) -> None:
         Bench(battery=None, safety=replace(SAFETY, battery_min_percent=0)).arm()
 
     def test_it_does_not_end_a_drive(self) -> None:
@@ -328,7 +310,7 @@ def test_a_suspended_machine_wakes_up_stopped() -> None:
     assert (bench.status.state, bench.status.cause) == ("stopped", "suspended")
 
 
-def test_a_bridge_that_stood_still_itself_stops_before_it_reads_what_has_queued_up() -> None:
+def test_a_stalled_bridge_stops_before_it_reads_queued_commands() -> None:
     bench = Bench().arm()
     bench.drive(500)
     bench.now_ns += 2_000 * MS

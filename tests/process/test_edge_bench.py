@@ -64,7 +64,7 @@ def test_an_interrupted_run_of_one_process_continues_to_the_same_trajectories_as
     assert before.items() <= hashes(out).items()
 
 
-def test_the_result_has_what_other_tools_rely_on(two_jobs: Path) -> None:
+def test_the_result_has_the_keys_that_other_tools_read(two_jobs: Path) -> None:
     result = json.loads(two_jobs.with_name("asked.json").read_text())
     assert {"episodes", "sr", "spl", "ne_m", "cr", "sr_ci95", "cr_ci95", "by_scene", "by_crowd", "by_robot"} <= set(
         result["summary"]

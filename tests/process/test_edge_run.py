@@ -134,7 +134,7 @@ def test_killed_while_driving_the_robot_gets_zero_within_300_ms(robot: Robot) ->
 
 
 @pytest.mark.slow
-def test_after_an_emergency_stop_the_runner_waits_and_says_so_in_one_line_until_an_operator_arms_it(
+def test_after_an_emergency_stop_the_runner_waits_and_reports_it_in_one_line_until_an_operator_arms_it(
     robot: Robot,
 ) -> None:
     waiting = "waiting for `edge-bridge arm`"

@@ -79,7 +79,7 @@ def test_only_nodes_that_compute_shapes_may_run_on_the_processor(
     assert check.level is level and found in check.found
 
 
-def test_every_graph_of_real_artifacts_runs_where_its_manifest_says(artifacts: Artifacts) -> None:
+def test_every_graph_of_real_artifacts_runs_on_its_manifests_provider(artifacts: Artifacts) -> None:
     checks = [profile_graph(artifacts, name) for name in artifacts.graphs]
     assert [check.level for check in checks] == [Level.OK] * len(artifacts.graphs), checks
 

@@ -170,7 +170,7 @@ def test_for_the_system_they_go_where_systemd_reads_them(units: Units, host: Hos
     assert (host.root / "etc/tic-vla-edge" / FIREWALL_FILE).is_file()
 
 
-def test_the_runners_memory_is_what_the_target_leaves_it(units: Units, tmp_path: Path) -> None:
+def test_the_runners_memory_is_the_targets_budget(units: Units, tmp_path: Path) -> None:
     units()
     device = load_target("cpu", "nano").device
     available = round((device.memory_gib - device.reserved_gib) * (1 << 30))

@@ -243,7 +243,7 @@ def test_other_options_and_another_model_need_another_engine(
         check(load_artifacts(directory), engines, built.machine())
 
 
-def test_the_key_says_nothing_of_power(orin: Artifacts, engines: Path) -> None:
+def test_the_key_does_not_depend_on_power(orin: Artifacts, engines: Path) -> None:
     build(orin, engines, silent, FakeTensorRt().machine())
     inputs = json.loads((engines / ENGINES_NAME).read_text())["graphs"]["vision_encoder"]["inputs"]
     facts = {"architecture", "device", "l4t", "onnxruntime", "provider_version"}

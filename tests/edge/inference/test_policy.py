@@ -131,7 +131,7 @@ def test_a_computing_tick_is_visible_to_other_threads(artifacts: Artifacts) -> N
     assert seen == ["begin", "end"]
 
 
-def test_a_graphs_own_workers_run_where_the_role_says(artifacts: Artifacts) -> None:
+def test_a_graphs_own_workers_run_on_the_roles_cores(artifacts: Artifacts) -> None:
     """`/proc` knows where a thread may run."""
     core = max(os.sched_getaffinity(0))
     tasks = Path("/proc/self/task")

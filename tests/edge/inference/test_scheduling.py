@@ -233,7 +233,7 @@ def test_ticks_that_have_stopped_are_not_waited_for(now_ms: int) -> None:
 
 
 @given(st.integers(0, 1000), st.integers(0, 300), st.integers(1, 95))
-def test_a_call_starts_within_two_periods_whatever_its_length(at_ms: int, needs_ms: int, tick_ms: int) -> None:
+def test_a_call_of_any_length_starts_within_two_periods(at_ms: int, needs_ms: int, tick_ms: int) -> None:
     """Ticks go on for ever; nobody starves."""
     now, activity, next_tick, tick_end = at_ms * MS, TickActivity(PERIOD_NS), 0, None
     time_ns = 0

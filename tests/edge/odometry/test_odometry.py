@@ -142,7 +142,7 @@ def test_thirty_seconds_are_remembered_and_not_much_more() -> None:
     assert estimator.motion_offset(now_ns - 31 * SECOND_NS) is None
 
 
-def test_the_history_that_is_driven_by_says_the_same_as_the_estimator() -> None:
+def test_the_pose_history_equals_the_estimator() -> None:
     path, estimator, history = drive(10, scale=1.02), DriftEstimator(), PoseHistory()
     for _, outputs in play(path, estimator, visual_motions(path)):
         if outputs.pose is not None:

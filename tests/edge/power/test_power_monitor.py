@@ -65,7 +65,7 @@ def test_a_record_has_the_fields_that_the_flight_log_describes() -> None:
     assert set(SCHEMAS["/power"]["properties"]) <= set(record)
 
 
-def test_a_meter_that_hangs_costs_its_value_and_nobody_waits_for_it() -> None:
+def test_a_hanging_meter_costs_its_value_and_delays_no_caller() -> None:
     hang = threading.Event()
 
     def read(now_ns: int) -> PowerSample:
@@ -216,7 +216,7 @@ def test_heat_becomes_a_finding_with_its_numbers_in_the_queue() -> None:
     assert "thermal-throttle" in found
 
 
-def test_a_thermal_source_that_stands_still_clears_neither_throttling_nor_trip_and_that_is_said_once() -> None:
+def test_a_stalled_thermal_source_clears_neither_throttling_nor_trip_and_is_reported_once() -> None:
     lines: list[str] = []
     heated = Heated(HOT, lines.append)
     for second in (1, 5, 60, 120):

@@ -286,7 +286,7 @@ def test_frames_after_the_newest_of_a_generation_are_left_for_the_next() -> None
     assert memory.way(ring, frame_at(59)) == way_of((frame_at(t).stamp_ns, pose_at(t)) for t in range(60))
 
 
-def test_watching_the_ring_looks_at_its_poses_once_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_watching_the_ring_reads_its_poses_once_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
     ring, memory, puts = TokenRing(100), InstructionMemory(None, ""), [0]
     put = PathMemory.put
 

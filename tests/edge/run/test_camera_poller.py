@@ -120,7 +120,7 @@ def test_a_stamp_is_never_before_the_request() -> None:
     assert poller.newest.stamp_ns >= requests[poller.frames - 1] - 5 * MS
 
 
-def test_failures_are_counted_and_the_next_frame_is_asked_for() -> None:
+def test_failures_are_counted_and_the_next_frame_is_requested() -> None:
     answers = iter([b"garbage", None, jpeg()])
 
     def request(_timeout_s: float) -> bytes:

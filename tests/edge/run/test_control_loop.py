@@ -139,7 +139,7 @@ def test_a_bridge_that_has_stopped_the_robot_ends_the_loop_with_the_fault(bench:
     assert bench.loop.supervision.active[0] == fault
 
 
-def test_a_stop_that_the_runner_itself_asked_for_is_no_fault(bench: Bench) -> None:
+def test_a_stop_that_the_runner_requested_is_no_fault(bench: Bench) -> None:
     bench.see()
     bench.sink.state, bench.sink.cause = "stopped", "client_stop"
     bench.loop.run(bench.now_ns, None)

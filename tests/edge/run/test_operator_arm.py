@@ -105,7 +105,7 @@ class TestBridge:
         bench.step(Arm())
         assert (bench.status.cause, bench.status.blocked_by) == ("operator", "estop")
 
-    def test_a_robot_found_moving_needs_an_operator_who_has_seen_that(self) -> None:
+    def test_a_robot_found_moving_needs_an_arm_given_after_the_motion(self) -> None:
         bench = bench_of(mode=None)
         bench.step(operator=(Arm(),))
         bench.mode, bench.robot = ids.MODE_BALANCE_STAND, {"vx_mps": 0.5}

@@ -232,7 +232,7 @@ def test_an_input_thread_that_dies_ends_the_run(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize(("planned_s", "trained_s"), [(4.0, 4.0), (float("inf"), 10.0)])
-def test_an_answer_may_be_as_old_as_the_plan_says(
+def test_the_age_limit_of_an_answer_follows_the_plan(
     monkeypatch: pytest.MonkeyPatch, planned_s: float, trained_s: float
 ) -> None:
     monkeypatch.setattr(assembly, "read_power_plan", lambda artifacts: SimpleNamespace(max_delay_s=planned_s))

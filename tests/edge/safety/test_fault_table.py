@@ -136,7 +136,7 @@ def test_findings_of_other_threads_are_taken_once_in_their_order() -> None:
     assert queue.take() == ()
 
 
-def test_a_queue_that_nobody_reads_stays_small_and_keeps_the_newest() -> None:
+def test_an_unread_queue_stays_small_and_keeps_the_newest() -> None:
     queue = FindingQueue(capacity=3)
     for index in range(10):
         queue.put((Finding("odometry-late", str(index)),))

@@ -111,7 +111,7 @@ def test_a_fault_is_an_event_when_it_begins_and_when_it_ends_and_not_in_between(
     assert outputs[2].events[0].stamp_ns == desk.now_ns
 
 
-def test_the_message_has_the_worst_fault_its_numbers_and_what_to_do() -> None:
+def test_the_message_has_the_worst_fault_its_numbers_and_advice() -> None:
     fault = FAULTS["tipped-over"]
     message = Desk().step("camera-slow", "tipped-over").message
     assert message == f"{fault.message.removesuffix('.')} (why). {fault.advice}"

@@ -85,7 +85,7 @@ def service(tmp_path: Path) -> Iterator[Service]:
         yield Service(manager)
 
 
-def test_a_long_step_of_start_up_asks_for_time_and_names_itself(service: Service) -> None:
+def test_a_long_step_of_start_up_extends_the_timeout_and_names_itself(service: Service) -> None:
     service.reporter.starting("verifying artifacts", 60)
     assert service.manager.messages() == [{"EXTEND_TIMEOUT_USEC": "60000000"}, {"STATUS": "verifying artifacts"}]
 

@@ -92,7 +92,7 @@ def test_without_an_action_expert_there_is_no_network(vlm: Path) -> None:
     assert "vlm: no action expert (60 tensors)" in refusal(vlm, fill_seed=None)
 
 
-def test_a_seed_fills_the_action_expert_and_says_untrained(vlm: Path) -> None:
+def test_a_seed_fills_the_action_expert_and_marks_it_untrained(vlm: Path) -> None:
     a = load_checkpoint([vlm], CONFIG, fill_seed=5)
     b = load_checkpoint([vlm], CONFIG, fill_seed=6)
     assert not a.info.trained

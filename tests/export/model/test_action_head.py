@@ -315,7 +315,7 @@ def test_ddim_with_the_best_denoiser_maps_noise_onto_the_data() -> None:
     torch.testing.assert_close(found, 0.4 + 0.5 * diffusion.noise, atol=0.02, rtol=0)
 
 
-def test_training_sees_every_noise_level_with_as_much_noise_as_it_says() -> None:
+def test_training_draws_every_noise_level_with_its_own_noise() -> None:
     diffusion = Diffusion(with_head(TINY, "diffusion", diffusion_steps=10).action)
     noisy, times = diffusion.corrupted(torch.full((4000, 11, 3), 2.0), seeded(0))
     shares = torch.tensor(cosine_schedule(10))

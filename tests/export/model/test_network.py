@@ -214,7 +214,7 @@ def test_neighbours_are_alike_and_no_two_places_are_the_same() -> None:
     assert float(alike[0, 100:].max()) < 0.8
 
 
-def test_a_pictures_codes_tell_row_and_column() -> None:
+def test_a_pictures_codes_identify_row_and_column() -> None:
     codes = grid_codes(64, 192).unflatten(0, (8, 8))
     assert torch.equal(codes[2, 1, :96], codes[2, 7, :96]) and torch.equal(codes[1, 5, 96:], codes[6, 5, 96:])
     assert not torch.allclose(codes[2, 1], codes[1, 2])

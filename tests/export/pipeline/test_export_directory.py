@@ -73,7 +73,7 @@ def test_a_link_to_a_directory_stays_a_link(artifacts_dir: Path, tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_an_older_directory_of_ours_is_replaced_if_its_files_are_as_it_says(
+def test_an_older_directory_of_ours_is_replaced_if_its_files_match_its_manifest(
     artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))

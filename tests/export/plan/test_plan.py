@@ -44,7 +44,7 @@ def test_the_paper_size_model_fits_the_two_boards_by_the_model(name: str) -> Non
 
 
 @pytest.mark.slow
-def test_the_stock_25_watt_mode_is_refused_with_what_exceeds_by_how_much_and_what_to_change() -> None:
+def test_the_stock_25_watt_mode_is_refused_with_the_excess_and_advice() -> None:
     made = planned("orin", "power.mode=25W")
     assert not made.fits
     with pytest.raises(PlanError) as refusal:

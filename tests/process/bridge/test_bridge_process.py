@@ -307,7 +307,7 @@ def test_an_operator_stops_a_driven_robot_and_only_an_operator_takes_it_back(
 
 
 @pytest.mark.slow
-def test_where_the_robot_file_says_so_an_operator_permits_every_single_arming(
+def test_where_the_robot_file_requires_it_an_operator_permits_every_single_arming(
     robot: FakeGo2, dds_domain: int, socket_path: Path, tmp_path: Path
 ) -> None:
     file = tmp_path / "robot.toml"
@@ -348,7 +348,7 @@ def test_an_idle_operator_connection_is_not_in_the_way_of_a_stop(bridge: Running
     idle.close()
 
 
-def test_systemd_hears_ready_the_state_the_watchdog_and_the_end(
+def test_systemd_receives_ready_the_state_the_watchdog_and_the_end(
     robot: FakeGo2, dds_domain: int, socket_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     arguments = ("--robot", GO2_SIM, "--domain", dds_domain, "--socket", socket_path)

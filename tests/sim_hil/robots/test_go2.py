@@ -215,7 +215,7 @@ def test_velocities_agree_with_positions(simulation: Simulation) -> None:
     assert moved == pytest.approx(np.mean(velocities, axis=0) * (after.time_s - before.time_s), abs=0.003)
 
 
-def test_feet_carry_the_robot_where_kinematics_says_they_are(simulation: Simulation) -> None:
+def test_feet_carry_the_robot_where_kinematics_places_them(simulation: Simulation) -> None:
     _stand(simulation)
     truth = simulation.truth()
     assert truth.foot_position_body_m[:, 2] == pytest.approx(0.022 - truth.body_height_m, abs=0.006)

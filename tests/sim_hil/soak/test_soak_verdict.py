@@ -125,7 +125,7 @@ def sample(t: float, rss_mib: float, pid: int = 7) -> dict[str, object]:
     return {"elapsed_s": t, "processes": {"edge-run": row}}
 
 
-def test_a_runner_that_leaks_fails_and_one_that_does_not_passes() -> None:
+def test_a_leaking_runner_fails_and_a_steady_one_passes() -> None:
     for growth, wanted in ((3.0, FAIL), (0.1, PASS)):
         leg = [sample(float(t), 250 + growth * t / 3600) for t in range(1200)]
         lines = {line.measure: line for line in load_budget(DEFAULT_BUDGET)}

@@ -138,7 +138,7 @@ class FrontEndContract:
     def rig(self) -> Iterator[Rig]:
         raise NotImplementedError
 
-    def test_it_gets_ready_when_asked_and_stays_where_it_is(self, rig: Rig) -> None:
+    def test_it_gets_ready_on_request_and_stays_where_it_is(self, rig: Rig) -> None:
         before = rig.place()
         assert not rig.client.is_ready()
         rig.make_ready()

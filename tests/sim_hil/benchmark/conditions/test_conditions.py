@@ -38,7 +38,7 @@ def test_the_robot_halts_at_its_own_stop_only_on_request() -> None:
     assert stays.stays and "halts at its own stop" in stays.describe()
 
 
-def test_a_switch_that_is_not_asked_for_is_the_manifests() -> None:
+def test_a_switch_without_an_option_is_the_manifests() -> None:
     free = asked("--policy", "artifacts:nano", "--decoding", "free")
     resolved = free.with_defaults_of(Decoding.CONSTRAINED, RecoverySwitch.OFF)
     assert (resolved.decoding, resolved.recovery) == ("free", "off")

@@ -142,7 +142,7 @@ def test_options_that_make_no_world_are_refused(options: dict[str, object]) -> N
         WorldOptions(**options)  # type: ignore[arg-type]
 
 
-def test_a_picture_has_the_size_asked_for_and_is_taken_once_an_observation() -> None:
+def test_a_picture_has_the_requested_size_and_is_taken_once_an_observation() -> None:
     with EpisodeWorld(corridor_episode(), WorldOptions(camera=(64, 48))) as world:
         image = world.observe().image
         assert image is not None and image.shape == (48, 64, 3) and image.dtype == np.uint8 and image.std() > 5

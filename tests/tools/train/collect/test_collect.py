@@ -194,7 +194,7 @@ def test_a_real_drive_is_made_of_a_training_scenario_and_is_the_same_in_any_proc
     assert len(drive.traces) == (len(drive) - 1) // 10 + 1
 
 
-def test_the_stage_collects_what_the_recipe_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_stage_collects_by_the_recipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(collection.fill, "__kwdefaults__", {**collection.fill.__kwdefaults__, "command": FAKE})
     result = collect(_job(tmp_path))
     assert result["drives"] == 3 and result["sha256"] == Dataset.open(tmp_path / "collect").sha256

@@ -171,7 +171,7 @@ def test_a_policys_collisions_are_kept_and_its_falls_are_not() -> None:
 
 
 @pytest.mark.slow
-def test_a_drive_that_lingers_comes_to_rest_at_the_goal_and_says_so_of_every_frame() -> None:
+def test_a_drive_that_lingers_comes_to_rest_at_the_goal_and_labels_every_frame_so() -> None:
     lingering = _drive(_expert_command, linger_s=6.0)
     pose = lingering.arrays["pose"]
     assert lingering.outcome == "reached"

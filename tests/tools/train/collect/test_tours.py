@@ -96,7 +96,7 @@ def test_it_goes_off_the_way_and_comes_back_to_it(straight_there: Recorded, with
 
 
 @pytest.mark.slow
-def test_it_says_turn_back_where_the_way_on_lies_behind_it(with_a_detour: Recorded) -> None:
+def test_its_plan_is_turn_back_where_the_route_lies_behind_it(with_a_detour: Recorded) -> None:
     plans = with_a_detour.arrays["plan_xy"][::10, 0]
     behind = np.abs(np.arctan2(plans[:, 1], plans[:, 0])) > 2.0
     says = np.array([trace["plan"] == "turn back" for trace in with_a_detour.traces])

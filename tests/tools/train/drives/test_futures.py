@@ -122,7 +122,7 @@ def test_before_a_fall_only_the_driven_steps_are_labelled() -> None:
 
 
 @pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (2.0, -1.0, 3.1), (-4.0, 5.0, -2.0)])
-def test_relative_is_what_se2_says(origin: tuple[float, float, float]) -> None:
+def test_relative_equals_the_se2_composition(origin: tuple[float, float, float]) -> None:
     poses = np.array([(1.0, 2.0, 0.3), (-3.0, 0.5, -3.0), (0.0, 0.0, pi - 0.01)])
     expected = [(SE2(*origin).inverse() @ SE2(*(float(v) for v in pose))).as_tuple() for pose in poses]
     assert np.allclose(relative(np.array(origin), poses), expected, atol=1e-12)

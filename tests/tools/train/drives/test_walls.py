@@ -151,7 +151,7 @@ def test_samples_have_walls_where_the_loss_uses_them(tmp_path: Path) -> None:
         collate([without, given_], CPU)
 
 
-def test_a_plan_that_leads_into_walls_is_told_from_one_that_follows_the_expert(tmp_path: Path, walls: Walls) -> None:
+def test_a_plan_into_walls_differs_in_loss_from_one_that_follows_the_expert(tmp_path: Path, walls: Walls) -> None:
     batch = collate([drawn(DriveFrames.of(in_corridor(), 30, SampleConfig().weights, walls), tmp_path)], CPU)
     batch = dataclasses.replace(batch, target=straight(-0.3).expand(4, -1, -1), known=KNOWN.expand(4, -1))
     assert batch.around is not None

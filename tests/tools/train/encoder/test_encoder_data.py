@@ -62,7 +62,7 @@ def test_held_out_layouts_are_never_learned_from_however_often_one_is_tried_agai
     assert tried[True] and tried[False] and not tried[True] & tried[False]
 
 
-def test_no_layout_is_the_benchmarks_or_one_that_drives_are_recorded_in() -> None:
+def test_no_layout_is_the_benchmarks_or_a_recorded_drives() -> None:
     highest = scenarios.RESERVED_BELOW + (scenarios.MAX_SEED + 1) * scenarios.LAYOUT_TRIES * scenarios.GROUPS
     for seed in (0, 1, 999, 2**31 - 1):
         for shard in plan(FramesConfig(count=3_000, held=500), seed, 8):

@@ -65,7 +65,7 @@ def costs(heads: EncoderHeads, labels: Mapping[str, Any], seen: torch.Tensor) ->
     return losses(heads(seen), as_tensors(labels, "cpu"), Balance.of(some_labels(40)))
 
 
-def test_a_cell_is_told_from_its_own_token_and_a_column_from_its_own_column(heads: EncoderHeads) -> None:
+def test_a_cell_depends_on_its_own_token_and_a_column_on_its_own_column(heads: EncoderHeads) -> None:
     before, row, column = tokens(1), 1, 2
     after = before.clone()
     after[0, row * SIDE + column] += torch.linspace(-1, 1, DIM)
@@ -155,7 +155,7 @@ def test_a_landmark_is_found_where_it_stands_and_not_beside_it(said: int, found:
     assert scored(right(with_machine(said)), with_machine(2))["landmark_bearing"] == found
 
 
-def test_missed_and_imagined_people_are_told_apart() -> None:
+def test_missed_and_imagined_people_are_counted_separately() -> None:
     labels = with_machine(3)
     labels["thing"][:, 6:, :2] = PERSON
     said = right(labels)

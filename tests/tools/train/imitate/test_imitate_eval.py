@@ -62,7 +62,7 @@ def test_a_policy_that_plans_as_the_expert_does_makes_no_error(samples: Samples)
     assert kept["fde_m"]["3s"] > 0.05 and straight["fde_m"]["3s"] > 0.01
 
 
-def test_ages_are_told_apart_and_add_up(samples: Samples) -> None:
+def test_errors_are_listed_by_age_and_add_up(samples: Samples) -> None:
     result = evaluate(lambda batch: batch.target, samples, FEW, seed=1, device=CPU)
     bins = result["by_delay"]
     assert [(each["from_s"], each["to_s"]) for each in bins] == [(0, 1), (1, 2), (2, 3), (3, 5), (5, 7), (7, 10)]

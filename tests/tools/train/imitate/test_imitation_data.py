@@ -168,7 +168,7 @@ def chance_of_frames(samples: Samples, count: int) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_every_frame_with_a_label_is_drawn_as_often_whatever_its_age_may_be(dataset: Dataset) -> None:
+def test_every_frame_with_a_label_is_drawn_equally_often_at_every_age(dataset: Dataset) -> None:
     samples = of(dataset, SampleConfig(group=8, standing_start=0.5, weights=EVEN))
     seen = chance_of_frames(samples, 4000)
     known = samples.drives[0].known >= LEAST_KNOWN
@@ -242,7 +242,7 @@ def test_without_injected_delay_every_state_is_of_its_frame(dataset: Dataset) ->
         assert np.abs(group.latency).max() < 1e-12
 
 
-def test_tokens_and_states_are_dropped_as_often_as_the_network_says(dataset: Dataset) -> None:
+def test_tokens_and_states_are_dropped_at_the_networks_rates(dataset: Dataset) -> None:
     found = drawn(of(dataset, drop=True), 400)
     kept = np.concatenate([group.keep_guidance.ravel() for _, group in found])
     states = np.concatenate([group.keep_state for _, group in found])

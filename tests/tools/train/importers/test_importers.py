@@ -113,7 +113,7 @@ def test_every_instant_has_the_newest_picture_that_was_there_by_then(recording: 
     assert ages.min() > -2e-5 and ages.max() < 1 / PICTURE_HZ + 1e-5
 
 
-def test_the_state_is_of_the_tenth_before_and_knows_nothing_of_what_comes(recording: Recording) -> None:
+def test_the_state_is_of_the_tenth_before_and_independent_of_later_motion(recording: Recording) -> None:
     (piece,) = pieces(recording)
     assert np.allclose(piece.state, (SPEED_MPS, 0.0, TURN_RADPS), atol=0.02)
 

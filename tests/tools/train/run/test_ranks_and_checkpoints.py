@@ -266,7 +266,7 @@ def test_two_processes_share_the_stages_that_can_be_shared_and_the_first_does_th
 
 
 @pytest.mark.slow
-def test_processes_stop_together_where_one_is_asked_to_and_go_on_together(tmp_path: Path) -> None:
+def test_processes_stop_together_on_one_request_and_go_on_together(tmp_path: Path) -> None:
     assert codes(two_ranks("tests.support.train.train_chain_rank", str(tmp_path), "stop")) == [EXIT_INTERRUPTED] * 2
     before = [(tmp_path / f"{rank}.txt").read_text().split() for rank in range(2)]
     assert before[0][-3] == before[1][-3] == "encoder"

@@ -134,7 +134,7 @@ def test_past_a_turn_that_was_missed_it_turns_back_and_not_before() -> None:
 
 
 @pytest.mark.slow
-def test_only_where_nobody_is_near_is_anything_learned(tmp_path: Path) -> None:
+def test_only_frames_without_people_nearby_are_relabelled(tmp_path: Path) -> None:
     scenario, drive, _ = _told("corridor")
     crowded = drive_along(scenario, "b", motion=CROWDED)
     dataset = write_dataset(tmp_path, [drive, crowded])
