@@ -370,7 +370,7 @@ def test_artifacts_whose_runner_would_run_before_the_bridge_are_refused(
         (DdsConfig(0, "eth0"), ("10.0.0.1/8",)),
     ],
 )
-def test_an_unknown_network_is_requested(dds: DdsConfig, given: tuple[str, ...]) -> None:
+def test_an_unknown_network_is_refused_with_the_option_that_sets_it(dds: DdsConfig, given: tuple[str, ...]) -> None:
     with pytest.raises(UnitError, match="--network"):
         networks(dds, *given)
     with pytest.raises(UnitError, match=r"eth0.*10\.0\.0\.0/8.*--network"):

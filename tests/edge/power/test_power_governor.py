@@ -256,7 +256,7 @@ def test_a_low_battery_lowers_the_budget_and_an_empty_one_ends_reasoning() -> No
     assert empty.findings == ("battery-empty", "battery-low") and not empty.budget.allowed
 
 
-def test_a_silent_battery_keeps_its_last_charge() -> None:
+def test_a_low_battery_stays_low_without_reports_and_clears_with_hysteresis() -> None:
     run = bench(25.0)
     run.step(1, battery_percent=15)
     assert run.step(60).findings == ("battery-low",)

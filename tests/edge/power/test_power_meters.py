@@ -225,7 +225,7 @@ def test_a_surface_too_hot_to_touch_slows_nothing_down(tmp_path: Path) -> None:
     assert state.throttle_margin_c == pytest.approx(28.0)
 
 
-def test_an_active_passive_trip_counts_as_throttling(tmp_path: Path) -> None:
+def test_a_passive_trip_counts_with_any_cooling_device(tmp_path: Path) -> None:
     root = copied(tmp_path, "orin_nx_jp6")
     zone = root / "class/thermal/thermal_zone0"
     (zone / "cdev1_trip_point").write_text("0\n")

@@ -163,7 +163,7 @@ def test_two_jumps_of_the_pose_within_ten_seconds_stop_the_run(rig: Rig) -> None
     assert rig.zero_after_ms(began_ns) <= FAULTS["odometry-jumps"].bound_ms
 
 
-def test_a_frozen_pose_during_a_walk_command_stops_the_robot_for_a_second(rig: Rig) -> None:
+def test_a_pose_that_stays_while_the_robot_is_told_to_walk_stops_it_for_a_second(rig: Rig) -> None:
     began_ns = rig.bench.now_ns
     rig.blocked = True
     rig.drive(0.8)

@@ -362,7 +362,7 @@ def test_the_card_names_its_data_and_its_scores(trained: RunDir, tmp_path: Path)
     assert card(trained, TINY, trained.model_path) == card(trained, TINY, trained.model_path)
 
 
-def test_scores_of_other_weights_are_refused(trained: RunDir, tmp_path: Path) -> None:
+def test_a_file_that_is_no_benchmark_result_is_refused(trained: RunDir, tmp_path: Path) -> None:
     (tmp_path / "other.json").write_text("{}")
     with pytest.raises(TrainError, match=r"result.json of edge-bench"):
         write_card(trained, TINY, [tmp_path / "other.json"])
