@@ -114,16 +114,6 @@ def test_the_budget_permits_a_generation_and_caps_its_tokens(bench: Bench, cap: 
     assert bench.language.caps == [tokens]
 
 
-def test_a_generation_under_way_ends_when_the_budget_is_withdrawn(bench: Bench) -> None:
-    def withdraw(_run: FakeRun) -> None:
-        bench.budget = ReasoningBudget(allowed=False)
-
-    bench.language.during_finish = withdraw
-    bench.frame(2.0)
-    assert not bench.loop.step()
-    assert (bench.slot.state, bench.cycle.cancelled) == (None, 1)
-
-
 # Late anchor
 
 
@@ -210,21 +200,6 @@ def test_a_call_that_hangs_makes_no_progress(bench: Bench, clock: Clock) -> None
     bench.frame(2.0)
     bench.loop.step()
     assert seen == [0]
-
-
-def test_the_time_spent_computing_is_counted(bench: Bench, clock: Clock) -> None:
-    seen: list[tuple[bool, int]] = []
-
-    def think(_run: FakeRun) -> None:
-        clock.s += 0.7
-        seen.append((bench.loop.busy, bench.loop.busy_ns))
-
-    bench.language.during_finish = think
-    bench.frame(2.0)
-    bench.loop.step()
-    clock.s += 5.0
-    assert seen == [(True, 700_000_000)]
-    assert (bench.loop.busy, bench.loop.busy_ns) == (False, 700_000_000)
 
 
 class Waiting:
