@@ -75,7 +75,7 @@ _BAD_INPUT = (ArtifactError, GraphError, LatencyError, CalibrationError, Instruc
 
 @command_line("edge-calib latency", {MeasureError: EXIT_CHECK_FAILED, **dict.fromkeys(_BAD_INPUT, EXIT_BAD_INPUT)})
 def run(args: argparse.Namespace) -> int:
-    """Measure or read, write; returns the exit code."""
+    """Measure generation times or read them from a log, write the profile and return the exit code."""
     _check(args)
     profile, measured = _measured(args) if args.artifacts is not None else (load_profile(args.log), None)
     if args.scale_to_mean is not None:

@@ -76,7 +76,7 @@ class Fit:
         return tuple(reasons)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON form."""
+        """Return the fit as JSON values."""
         return {
             "idle_w": self.idle_w,
             "idle_error_w": self.idle_error_w,

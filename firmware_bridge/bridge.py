@@ -20,21 +20,24 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from firmware_bridge.client_link import USER_ONLY, ClientLink, SocketGroups, SocketTakenError
 from firmware_bridge.core.config import OPERATOR_SUFFIX, SERVICE_SOCKET, ConfigError, RobotConfig, load_robot_config
 from firmware_bridge.core.link import BridgeStatus
+from firmware_bridge.core.robot_state import DdsError
 from firmware_bridge.core.rules import BridgeCore
 from firmware_bridge.core.step_types import Call, Inputs, Move, Outputs
+from firmware_bridge.core.version import version_line
 from firmware_bridge.latch_file import LatchFile, read_latch
 from firmware_bridge.line_log import LineLog
 from firmware_bridge.notify import Notifier
 from firmware_bridge.output_file import check_output, write_descriptor, write_output
-from firmware_bridge.unitree.dds import DdsError
 from firmware_bridge.unitree.late_interface import AbsentRobot, is_interface_up
 from firmware_bridge.unitree.messages import ids
-from firmware_bridge.unitree.robot_link import RobotLink
+
+if TYPE_CHECKING:
+    from firmware_bridge.unitree.robot_link import RobotLink
 
 _OPERATORS: Final = 4  # at a time
 _LOG_TIMEOUT_S: Final = 0.5
@@ -77,6 +80,10 @@ class Bridge:
         self._log = log
         self._notifier = notifier
         self._config = config
+        # Only a process that serves needs the DDS binding; a missing one is found here, before the bridge is ready.
+        from firmware_bridge.unitree.robot_link import RobotLink
+
+        self._open_link = RobotLink
         self._robot: RobotLink | AbsentRobot = AbsentRobot(config.dds.interface)
         self._join_robot()
         self._link = ClientLink(config.bridge.socket, group=groups.runner)
@@ -147,7 +154,7 @@ class Bridge:
         """Join the robot's network as soon as its interface is up; whether that has happened in this call."""
         if not isinstance(self._robot, AbsentRobot) or not is_interface_up(self._robot.interface):
             return False
-        self._robot = RobotLink(self._config, self._log.write)
+        self._robot = self._open_link(self._config, self._log.write)
         settle_memory()
         return True
 
@@ -274,6 +281,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--runner-group", metavar="NAME", help="serve: group that may command (default: none)")
     parser.add_argument("--operator-group", metavar="NAME", help="serve: group that may stop and arm (default: none)")
     parser.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
+    parser.add_argument("--version", action="version", version=version_line("edge-bridge"))
     args = parser.parse_args(argv)
     try:
         if args.json not in (None, "-"):
@@ -294,6 +302,11 @@ def main(argv: list[str] | None = None) -> int:
     except (SocketTakenError, ConfigError, DdsError) as error:
         sys.stderr.write(f"edge-bridge: {error}\n")
         return 3 if isinstance(error, SocketTakenError) else 2
+    except ModuleNotFoundError as error:
+        sys.stderr.write(
+            f"edge-bridge: {error.name} is missing: pip install 'tic-vla-edge[unitree]' (arm64: edge-install dds)\n"
+        )
+        return 2
     text = json.dumps(result, indent=2) + "\n"
     try:
         if args.json == "-":

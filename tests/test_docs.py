@@ -161,8 +161,8 @@ def test_the_readme_stays_short() -> None:
     ("question", "page", "answer"),
     [
         ("Where is a velocity limited?", "docs/architecture.md", "edge/motion/controller.py"),
-        ("What happens when the camera freezes?", "docs/faults.md", "camera-frozen"),
-        ("how to add a CAN robot", "CONTRIBUTING.md", "firmware_bridge/core/config.py"),
+        ("What happens when the camera freezes?", "docs/architecture.md", "camera-frozen"),
+        ("How do I add a CAN robot?", "CONTRIBUTING.md", "firmware_bridge/core/config.py"),
     ],
 )
 def test_the_readme_leads_a_newcomers_question_to_its_answer(question: str, page: str, answer: str) -> None:

@@ -13,7 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
-SCHEMA_VERSION = 3
+from firmware_bridge.core.version import ARTIFACT_SCHEMA
+
+SCHEMA_VERSION = ARTIFACT_SCHEMA
 MANIFEST_NAME = "manifest.json"
 SIGNATURE_NAME = "manifest.sig"
 """Beside the manifest, which cannot list it: it signs the manifest's bytes (`edge.artifacts.trust`)."""

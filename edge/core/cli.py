@@ -14,8 +14,9 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import FrameType
-from typing import Any, ParamSpec, TextIO
+from typing import Any, Final, ParamSpec, TextIO
 
+from firmware_bridge.core.version import version_line
 from firmware_bridge.output_file import (
     check_output,
     open_through,
@@ -95,9 +96,9 @@ def named_file(path: Path) -> Iterator[Path]:
 
 
 def write_whole(path: Path, text: str | bytes) -> None:
-    """Write a file in one rename, so that a file that is there is whole; raises OSError and leaves nothing.
+    """Write a file in one rename, so that no reader sees a part of it. Raises OSError and leaves no file then.
 
-    A device or a FIFO is written to as it is, a symbolic link leads to the file that is replaced.
+    A device or a FIFO is written in place. Of a symbolic link, the target file is replaced.
     """
     write_output(path, text.encode() if isinstance(text, str) else text)
 
@@ -193,14 +194,41 @@ def _give_up_stdout() -> None:
         os.close(null)
 
 
-def run_with_extra(command: str, module: str, extra: str) -> int:
-    """Run `module.main()` of an optional part; without its packages, write one line: how to install them."""
+# Module -> extra of pyproject.toml that installs it.
+_EXTRAS: Final = {
+    "onnxruntime": "cpu", "cyclonedds": "unitree", "pymavlink": "mavlink", "can": "can", "cantools": "can",
+    "torch": "export", "onnx": "export", "onnxscript": "export", "safetensors": "export", "jinja2": "export",
+    "pybullet": "sim", "panda3d": "sim", "direct": "sim", "scipy": "sim", "gymnasium": "sim", "matplotlib": "sim",
+    "cryptography": "sign", "ray": "cluster",
+}  # fmt: skip
+
+
+def missing_extra(error: ModuleNotFoundError, extra: str = "") -> str | None:
+    """Return one line on how to install the missing module; None where no extra has it."""
+    name = (error.name or "").partition(".")[0]
+    needed = extra or _EXTRAS.get(name, "")
+    if name not in _EXTRAS and not extra:
+        return None
+    also = ", or NVIDIA's onnxruntime-gpu on a Jetson" if name == "onnxruntime" else ""
+    also = " (arm64: edge-install dds)" if name == "cyclonedds" else also
+    return f"needs the packages of the extra {needed!r} ({name} is missing): pip install 'tic-vla-edge[{needed}]'{also}"
+
+
+def run_with_extra(command: str, module: str, extra: str = "") -> int:
+    """Run `module.main()`; `--version` needs none of its packages, a missing extra is one line that names it."""
+    report = messages(command)
+    if sys.argv[1:] == ["--version"]:
+        sys.stdout.write(f"{version_line(command)}\n")
+        return EXIT_DONE
     try:
         main = importlib.import_module(module).main
+        return int(main())
     except ModuleNotFoundError as error:
-        sys.stderr.write(
-            f"{command}: needs the packages of the extra {extra!r} ({error.name} is missing): "
-            f"pip install 'tic-vla-edge[{extra}]'\n"
-        )
+        line = missing_extra(error, extra)
+        if line is None:
+            raise
+        report(line)
         return EXIT_BAD_INPUT
-    return int(main())
+    except KeyboardInterrupt:  # while modules load; afterwards the command answers itself
+        report("interrupted")
+        return EXIT_INTERRUPTED

@@ -20,7 +20,7 @@ from edge.core.cli import (
     messages,
     write_result,
 )
-from edge.deploy import install_units
+from edge.deploy import dds_binding, install_units
 from edge.deploy.unit_text import UnitError
 from edge.inference import engines
 from edge.reasoning.prompt import InstructionError
@@ -32,6 +32,7 @@ EXAMPLES = """examples:
   edge-install units --artifacts out/orin --robot go2.toml --instruction "walk to the vending machine" --out units
   sudo edge-install units --artifacts /opt/tic-vla/orin --robot /etc/tic-vla/go2.toml --target orin \\
        --instruction-file /etc/tic-vla/instruction.txt --network 192.168.123.161/32 --system
+  edge-install dds
 
 units needs a robot file with operator_arm = true in [safety], or --arm-at-start. An interrupted build of engines keeps
 the finished ones: run it again to go on.
@@ -59,6 +60,7 @@ def parser() -> argparse.ArgumentParser:
         "units", help="write systemd units, users and firewall of bridge and runner, and check them"
     )
     install_units.add_arguments(service)
+    dds_binding.add_arguments(commands.add_parser("dds", help="install a Cyclone DDS binding that works on this board"))
     return p
 
 
@@ -78,6 +80,8 @@ def main(
 ) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
+    if args.command == "dds":
+        return dds_binding.run(args, _print)
     check_result_target(args.json)
     if args.command == "units":
         return install_units.run(args, _print, host)

@@ -88,7 +88,7 @@ def _read_part(path: Path) -> Iterator[tuple[str, int, dict[str, Any]]]:
 
 
 def jpeg_bytes(payload: dict[str, Any]) -> bytes:
-    """The JPEG in a `foxglove.CompressedImage` payload; ValueError when it holds none."""
+    """Return the JPEG of a `foxglove.CompressedImage` payload. Raises ValueError if there is none."""
     try:
         return base64.b64decode(payload["data"], validate=True)
     except (KeyError, TypeError, binascii.Error) as error:

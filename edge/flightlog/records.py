@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from edge.core.geometry import SE2
 from edge.odometry.drift_rate import DriftRate
-from firmware_bridge.unitree.messages.state import BatteryState, RobotState
+from firmware_bridge.core.robot_state import BatteryState, RobotState
 
 
 class Throttle:

@@ -253,7 +253,7 @@ class GenerationRun:
     def finish(
         self, segments: Sequence[Segment], *, max_new_tokens: int, constraint: TextConstraint | None = None
     ) -> Generation:
-        """Prefill the rest of the prompt, whose last token is text, and decode greedily what `constraint` allows."""
+        """Prefill the rest of the prompt, then decode greedily within `constraint`. The last token must be text."""
         model, runtime = self._model, self._model.runtime
         started_ns = time.monotonic_ns()
         *head, last = self._cut(segments)

@@ -37,7 +37,7 @@ class ReleaseDelay:
             raise ReleaseDelayError(f"expected low ≤ mean ≤ high ≤ {MAX_DELAY_S} s, found {values}")
 
     def sampler(self) -> Callable[[], float]:
-        """A source of delays in s; the same seed gives the same sequence."""
+        """Return a function that draws delays (s). The same seed gives the same sequence."""
         generator = random.Random(self.seed)
         if self.sd_s == 0 or self.mean_s == 0:
             return lambda: self.mean_s

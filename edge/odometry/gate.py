@@ -302,7 +302,7 @@ class StillCheck:
         return False
 
     def take_rate(self) -> tuple[float, float] | None:
-        """Mean yaw rate at rest, rad/s, and over how many s, once there is enough of it; each is given only once."""
+        """Return mean yaw rate at rest (rad/s) and duration (s) once it is long enough. Each mean is returned once."""
         if self._seconds * 1e9 < STILL_NS:
             return None
         taken = (self._turned_rad / self._seconds, self._seconds)

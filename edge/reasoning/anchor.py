@@ -39,7 +39,7 @@ class Anchor:
 
     @classmethod
     def now(cls, newest_ns: int) -> Anchor:
-        """The frame that is newest already."""
+        """Return an anchor whose newest frame is already captured."""
         return cls(newest_ns, newest_ns, 0)
 
     def older_ns(self, offset_s: float) -> int:

@@ -32,23 +32,23 @@ class StoppedEarlyError(RuntimeError):
 
 
 class Bridge(Protocol):
-    """What arming needs of a `BridgeClient`."""
+    """The methods of `BridgeClient` that arming uses."""
 
     def arm(self) -> bool:
-        """Ask it to stand the robot up and take commands."""
+        """Send the bridge a request to stand the robot up and to accept commands."""
 
     def send_velocity(self, seq: int, stamp_ns: int, vx_mps: float, vy_mps: float, wz_radps: float) -> bool:
-        """One command."""
+        """Send one velocity command; returns whether it was sent."""
 
     def poll(self) -> BridgeStatus | None:
         """Newest status; raises BridgeUnavailable."""
 
 
 class StoppableBridge(Protocol):
-    """What stopping needs of a `BridgeClient`."""
+    """The methods of `BridgeClient` that stopping uses."""
 
     def stop(self) -> bool:
-        """Ask it to stop the robot."""
+        """Send the bridge a request to stop the robot."""
 
     def poll(self) -> BridgeStatus | None:
         """Newest status; raises BridgeUnavailable."""

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from edge.core.jpeg import jpeg_refusal
 from edge.state.frame import Frame, fit_frame
-from firmware_bridge.unitree.client import CameraError
+from firmware_bridge.core.robot_state import CameraError
 
 
 def decode_frame(jpeg: bytes, image_px: int) -> npt.NDArray[np.uint8]:

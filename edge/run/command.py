@@ -42,7 +42,7 @@ from edge.run.session import RunSession
 from edge.state.switches import Decoding, RecoverySwitch, SwitchOptions
 from firmware_bridge.client import BridgeUnavailable
 from firmware_bridge.core.config import ConfigError, RobotConfig, load_robot_config
-from firmware_bridge.unitree.dds import DdsError
+from firmware_bridge.core.robot_state import DdsError
 
 EXAMPLES = """examples:
   edge-run --artifacts out/nano --robot go2.toml --instruction "walk to the vending machine"

@@ -29,7 +29,7 @@ from edge.state.frame import Frame
 from edge.state.pose_history import PoseHistory
 from firmware_bridge.client import BridgeClient, BridgeStatus
 from firmware_bridge.core.config import RobotConfig
-from firmware_bridge.unitree.client import BatteryState, Go2Reader, RobotState
+from firmware_bridge.core.robot_state import BatteryState, RobotState
 
 ODOMETRY_LOG_HZ = 50.0
 BATTERY_LOG_HZ = 1.0
@@ -88,6 +88,8 @@ class RobotInputs:
         if mount is not None:
             hfov_rad, pitch_rad = math.radians(mount.hfov_deg), math.radians(mount.pitch_deg)
             self._eye = VisualOdometry(CameraGeometry(hfov_rad, mount.height_m, pitch_rad, mount.forward_m))
+        from firmware_bridge.unitree.client import Go2Reader  # needs the extra of its protocol
+
         self.reader = Go2Reader(robot, on_death=on_death)
         self.reader.set_state_listener(self._on_state)
         self.camera = CameraPoller(

@@ -121,9 +121,9 @@ def fsync_path(path: Path) -> None:
 
 @contextmanager
 def open_cache(directory: Path, limit_bytes: int, say: Callable[[str], None]) -> Iterator[StageCache]:
-    """A cache to work with; afterwards the entries used longest ago go until the rest fits `limit_bytes`.
+    """Open the cache. On exit, remove the least recently used entries until the rest fits `limit_bytes`.
 
-    Entries go only while no other process has the cache open. Raises CacheError, also for a directory of another use.
+    Entries are removed only if no other process has the cache open. Raises CacheError, also for a foreign folder.
     """
     try:
         directory.mkdir(parents=True, exist_ok=True)
@@ -214,7 +214,7 @@ class StageCache:
         return {k: float(v) for k, v in pairs if isinstance(v, int | float) and not isinstance(v, bool) and v >= 0}
 
     def remember_timings(self, run: str, seconds: Mapping[str, float]) -> None:
-        """Keep the seconds of the stages that were built; they only serve the next run's estimate."""
+        """Store the durations (s) of the built stages, for the next run's estimate only."""
         content = self._all_timings()
         content[run] = {**self.timings(run), **{k: round(v, 3) for k, v in seconds.items()}}
         write_whole(self.directory / _TIMINGS_NAME, json.dumps(content, indent=1, sort_keys=True) + "\n")

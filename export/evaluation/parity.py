@@ -237,7 +237,7 @@ def load_samples(path: Path) -> list[Sample]:
 
 
 def save_outputs(outputs: StageOutputs, path: Path) -> None:
-    """Write the reference of the task error to one safetensors file."""
+    """Write the reference outputs for the task error to one safetensors file."""
     tensors = {
         f"{kind}/{index}": np.ascontiguousarray(array)
         for kind in ("visual", "kv", "trajectories", "swapped")

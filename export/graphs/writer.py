@@ -219,7 +219,7 @@ class GraphWriter:
         return self.cast(x, TensorProto.FLOAT) if self.half else x
 
     def from_float32(self, x: str) -> str:
-        """x, which is in fp32, in the graph's float type."""
+        """Convert the fp32 tensor `x` to the graph's float type."""
         return self.cast(x, self.float_type) if self.half else x
 
     def stored(self, value: Array, name: str, precision: str) -> str:

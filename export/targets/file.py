@@ -138,7 +138,7 @@ class Target:
         return {"provider": provider.name, "options": options, "threads": policy.threads, "engine": provider.engine}
 
     def to_dict(self) -> dict[str, Any]:
-        """Tables that `parse_target` reads back."""
+        """Return the target as tables that `parse_target` reads."""
         content = plain(self)
         content["gates"][TASK_GATE] = content.pop("task_gate")
         return {"schema": SCHEMA, **content}

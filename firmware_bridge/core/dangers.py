@@ -6,9 +6,9 @@ import math
 from typing import Final
 
 from firmware_bridge.core.config import SafetyConfig
+from firmware_bridge.core.robot_state import RobotState
 from firmware_bridge.core.step_types import Inputs
 from firmware_bridge.unitree.messages import ids
-from firmware_bridge.unitree.messages.state import RobotState
 
 _NS_PER_S: Final = 1_000_000_000
 _NEVER_NS: Final = -(2**62)
@@ -30,7 +30,7 @@ NO_BATTERY: Final = ("battery_low", "no battery report")
 
 
 class DangerWatch:
-    """Remembers the newest reports and finds what forbids motion now."""
+    """The robot's newest reports and the dangers in them that forbid motion now."""
 
     def __init__(self, safety: SafetyConfig, state_timeout_ns: int) -> None:
         self.robot: RobotState | None = None

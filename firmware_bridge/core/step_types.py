@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from firmware_bridge.core.link import BridgeStatus, Message
-from firmware_bridge.unitree.messages.state import RobotState
+from firmware_bridge.core.robot_state import RobotState
 
 
 @dataclass(frozen=True)

@@ -8,23 +8,18 @@ from collections.abc import Callable
 from typing import Final
 
 from firmware_bridge.core.config import RobotConfig
+from firmware_bridge.core.robot_state import BatteryState, CameraError, RobotState, StampOrder
 from firmware_bridge.unitree.dds import Bus, take_each
 from firmware_bridge.unitree.messages.idl import SportModeState_
 from firmware_bridge.unitree.messages.idl_low import LowState_
 from firmware_bridge.unitree.messages.ids import GET_IMAGE_SAMPLE, LF_LOW_STATE_TOPIC, SPORT_STATE_TOPIC, VIDEO_SERVICE
-from firmware_bridge.unitree.messages.state import BatteryState, RobotState, StampOrder, battery_state, robot_state
 from firmware_bridge.unitree.publishers import PublisherWatch
+from firmware_bridge.unitree.report import battery_state, robot_state
 from firmware_bridge.unitree.rpc import RpcClient, RpcError
-
-__all__ = ["BatteryState", "CameraError", "Go2Reader", "RobotState", "robot_state"]
 
 _WAIT_NS: Final = 100_000_000  # how soon close() is noticed
 _BATTERY_PERIOD_NS: Final = 500_000_000  # decoding a low state costs as much as ten odometry reports
 _JPEG_START: Final = b"\xff\xd8"
-
-
-class CameraError(RuntimeError):
-    """No usable camera frame; one line with the reason."""
 
 
 class Go2Reader:

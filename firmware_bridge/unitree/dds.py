@@ -7,7 +7,6 @@ import struct
 from collections.abc import Iterator
 from typing import Any, Final
 
-from cyclonedds._clayer import ddspy_take
 from cyclonedds.core import DDSException, InstanceState, ReadCondition, SampleState, ViewState, WaitSet
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.pub import DataWriter
@@ -16,6 +15,8 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 
 from firmware_bridge.core.config import DdsConfig
+from firmware_bridge.core.robot_state import DdsError
+from firmware_bridge.unitree.messages.binding import take_undecoded
 
 # Everything a hostile or foreign sample can make the pure-Python CDR decoder raise.
 DECODE_ERRORS: Final = (struct.error, ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError)
@@ -23,11 +24,6 @@ MAX_SAMPLE_BYTES: Final = 10 * 1024 * 1024  # more than a camera frame
 # What a call into DDS itself can raise.
 DDS_ERRORS: Final = (DDSException,)
 _FRESH: Final = ViewState.Any | InstanceState.Alive | SampleState.NotRead
-_ANY: Final = ViewState.Any | InstanceState.Any | SampleState.Any
-
-
-class DdsError(RuntimeError):
-    """DDS cannot start; one line for the operator."""
 
 
 def domain_xml(config: DdsConfig, max_sample_bytes: int = MAX_SAMPLE_BYTES) -> str:
@@ -108,7 +104,7 @@ def take_each(reader: DataReader[Any], limit: int = 64, max_bytes: int = MAX_SAM
     Notices without data (a writer has left) are passed over.
     """
     for _ in range(limit):
-        taken = ddspy_take(reader._ref, _ANY, 1)  # what DataReader.take does, which decodes whatever the size
+        taken = take_undecoded(reader)  # what DataReader.take does, which decodes whatever the size
         if isinstance(taken, int):
             raise DDSException(taken, "Occurred while taking data")
         if not taken:

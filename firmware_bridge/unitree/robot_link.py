@@ -9,14 +9,15 @@ from typing import Any, Final
 from cyclonedds.sub import DataReader
 
 from firmware_bridge.core.config import RobotConfig
+from firmware_bridge.core.robot_state import RobotState, StampOrder, within
 from firmware_bridge.core.step_types import Call, Move, Report
 from firmware_bridge.unitree.dds import Bus, take_each
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.messages.idl import Request_, SportModeState_, WirelessController_
 from firmware_bridge.unitree.messages.idl_low import LowState_
-from firmware_bridge.unitree.messages.state import RobotState, StampOrder, battery_state, robot_state, within
 from firmware_bridge.unitree.publishers import PublisherWatch
 from firmware_bridge.unitree.remote import StopKeys
+from firmware_bridge.unitree.report import battery_state, robot_state
 from firmware_bridge.unitree.requests import Requester, move_parameter
 
 _MAX_UNANSWERED: Final = 32
@@ -67,7 +68,7 @@ class RobotLink:
         return Report(state, in_use, estop, foreign, denied, publishers, battery_percent, version, failing)
 
     def write(self, request: Move | Call) -> None:
-        """Send one request and wait for nothing; what the network does not take is counted."""
+        """Send one request without waiting. A request that the network does not accept is counted."""
         if isinstance(request, Move):
             parameter = move_parameter(request.vx_mps, request.vy_mps, request.wz_radps)
             self._sport.send(ids.MOVE, parameter, noreply=True)

@@ -6,6 +6,7 @@ import time
 from typing import Final
 
 from firmware_bridge.unitree.dds import Bus
+from firmware_bridge.unitree.messages.binding import has_reader, has_writer
 from firmware_bridge.unitree.requests import MAX_BINARY_BYTES, Requester, Response, make_request, move_parameter
 
 __all__ = ["MAX_BINARY_BYTES", "Response", "RpcClient", "RpcError", "make_request", "move_parameter"]
@@ -32,7 +33,7 @@ class RpcClient(Requester):
 
     def connected(self) -> bool:
         """Whether the service's two ends have been discovered."""
-        return bool(self._writer.get_matched_subscriptions()) and bool(self._reader.get_matched_publications())
+        return has_reader(self._writer) and has_writer(self._reader)
 
     def call(self, api_id: int, parameter: str = "", *, timeout_s: float) -> Response:
         """Send and wait for the answer. Raises RpcError: no service, no answer in time, or the robot's error code."""

@@ -24,7 +24,8 @@ from edge.core.cli import (
     write_result,
 )
 from firmware_bridge.core.config import ConfigError
-from firmware_bridge.unitree.dds import DDS_ERRORS, DdsError
+from firmware_bridge.core.robot_state import DdsError
+from firmware_bridge.unitree.dds import DDS_ERRORS
 from sim_hil.hil.display import check_display
 from sim_hil.hil.loop import POSE_HZ, STEPS_PER_S, HilLoop
 from sim_hil.hil.trace import TraceWriter

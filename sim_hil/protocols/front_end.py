@@ -74,7 +74,7 @@ class FrontEnd(Protocol):
         ...
 
     def wait(self, left_ns: int) -> None:
-        """Wait until data arrives, at most `left_ns`."""
+        """Wait until data arrives, at most `left_ns` nanoseconds."""
         ...
 
     def serve(self) -> list[ReceivedCommand]:

@@ -183,7 +183,7 @@ class Bench:
 
 
 def machine() -> dict[str, Any]:
-    """Processor, its instruction sets that matter here, cores and memory."""
+    """Return the processor's name, relevant instruction sets, number of cores and memory."""
     wanted = {"avx2", "avx512f", "avx512_vnni", "avx512_bf16", "avx_vnni", "amx_int8", "amx_bf16", "asimddp", "i8mm"}
     info = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     fields = {line.partition(":")[0].strip(): line.partition(":")[2].strip() for line in info if ":" in line}

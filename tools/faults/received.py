@@ -38,7 +38,7 @@ class ReceivedCommands:
         self._requests: deque[ReceivedCommand] = deque()
 
     def update(self) -> None:
-        """Read the lines that were added."""
+        """Read the lines that the robot has written since the last call."""
         for line in self._tail.lines():
             found = line["velocity"]
             velocity = (float(found[0]), float(found[1]), float(found[2])) if isinstance(found, list) else None

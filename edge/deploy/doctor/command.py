@@ -30,11 +30,12 @@ from edge.core.cli import (
     messages,
     write_result,
 )
-from edge.core.device import available_providers
+from edge.core.device import available_providers, package_version
 from edge.deploy.doctor import graphs as doctor_graphs
 from edge.deploy.doctor import machine as doctor_machine
 from edge.deploy.doctor import rights as doctor_rights
 from edge.deploy.doctor import robot as doctor_robot
+from edge.deploy.doctor import runtime as doctor_runtime
 from edge.deploy.doctor.check import Check, Level, failed, skipped, table
 from edge.deploy.doctor.rights import UserRights, user_named
 from edge.deploy.unit_check import run_command
@@ -169,12 +170,13 @@ def _artifacts(args: argparse.Namespace) -> tuple[Artifacts | None, Check]:
 def _machine(
     args: argparse.Namespace, root: Path, artifacts: Artifacts | None, facts: TargetFacts | None, plan: PlanFacts | None
 ) -> Iterator[Check]:
+    wanted = sorted({graph.session.provider for graph in artifacts.graphs.values()}) if artifacts is not None else []
+    yield doctor_runtime.onnx_runtime(wanted, available_providers(), package_version, platform.machine(), root)
     if artifacts is None or facts is None:
         yield skipped("target", "the artifacts name none" if artifacts is not None else "no artifacts")
         yield skipped("power mode", "no target")
     else:
-        providers = sorted({graph.session.provider for graph in artifacts.graphs.values()})
-        yield doctor_machine.match(facts, providers, platform.machine(), available_providers(), root)
+        yield doctor_machine.match(facts, wanted, platform.machine(), available_providers(), root)
         yield doctor_machine.power_mode(facts.power_mode, root, _nvpmodel)
     yield doctor_machine.clocks(root)
     yield doctor_machine.cpu_governor(root)

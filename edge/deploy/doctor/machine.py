@@ -246,7 +246,7 @@ def wall_clock(now: datetime.datetime, not_before: datetime.datetime, root: Path
 
 
 def processor_ticks(proc: Path) -> dict[int, tuple[str, int]]:
-    """Name and processor time so far, in clock ticks, of every process below a proc folder."""
+    """Return name and processor time (clock ticks) of every process below a proc folder."""
     times: dict[int, tuple[str, int]] = {}
     for path in proc.glob("[0-9]*/stat"):
         # The name is in brackets and may itself contain brackets and spaces: fields count from the last one.

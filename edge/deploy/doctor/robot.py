@@ -15,8 +15,7 @@ from edge.run.camera import decode_frame
 from firmware_bridge.client import BridgeClient, BridgeUnavailable
 from firmware_bridge.core.config import OPERATOR_SUFFIX, RobotConfig
 from firmware_bridge.core.link import BridgeStatus
-from firmware_bridge.unitree.client import CameraError, Go2Reader, RobotState
-from firmware_bridge.unitree.dds import DdsError
+from firmware_bridge.core.robot_state import CameraError, DdsError, RobotState
 
 T = TypeVar("T")
 
@@ -83,6 +82,16 @@ class Reader(Protocol):
         """Leave the bus."""
 
 
+def open_go2(robot: RobotConfig) -> Reader:
+    """Join the robot's DDS domain. Raises DdsError, also where the binding is missing."""
+    try:
+        from firmware_bridge.unitree.client import Go2Reader
+    except ModuleNotFoundError as error:
+        advice = "pip install 'tic-vla-edge[unitree]' (arm64: edge-install dds)"
+        raise DdsError(f"{error.name} is missing: {advice}") from error
+    return Go2Reader(robot)
+
+
 def ask_bridge(robot: RobotConfig) -> BridgeStatus | None:
     """Status of the bridge over the operator's socket, which leaves the runner its own; raises BridgeUnavailable."""
     client = BridgeClient(f"{robot.bridge.socket}{OPERATOR_SUFFIX}")
@@ -116,7 +125,7 @@ def robot_link(
     robot: RobotConfig,
     image_px: int,
     *,
-    open_reader: Callable[[RobotConfig], Reader] = Go2Reader,
+    open_reader: Callable[[RobotConfig], Reader] = open_go2,
     timeout_s: float = STATE_TIMEOUT_S,
 ) -> list[Check]:
     """Whether the robot reports its state, and one picture of its camera."""

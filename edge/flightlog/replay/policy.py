@@ -24,7 +24,7 @@ from edge.state.pose_history import PoseHistory, StampedPose
 from edge.state.reasoning_text import parse_waypoints
 from edge.state.ring import EncodedFrame
 from edge.state.semantic import SemanticState
-from firmware_bridge.unitree.client import CameraError
+from firmware_bridge.core.robot_state import CameraError
 
 FRAMES_KEPT_NS = 120_000_000_000
 """How long a picture is kept for a generation that names it: its 9 s of past, its own time, and a release delay."""

@@ -1,9 +1,7 @@
 """The Unitree DDS types that a Go2 speaks.
 
-Every octet is declared `types.byte`, never `types.uint8`: cyclonedds-python 11 announces `uint8` as the XTypes kind
-TK_UINT8, which Cyclone DDS 0.10.2 (the version in the robot) does not know and dies of in its discovery thread.
-`byte` gives the same announcement as 0.10.2's own compiler, and the same bytes on the wire. The structs are final with
-sequential member ids, which are this library's defaults. Field lists: unitreerobotics/unitree_ros2 (BSD-3).
+Every octet is declared `Octet` (reason: `binding.py`). The structs are final with sequential member ids, which are
+this library's defaults. Field lists: unitreerobotics/unitree_ros2 (BSD-3).
 Low-level types, which the bridge does not need, are in `idl_low.py`.
 """
 
@@ -16,6 +14,8 @@ from typing import TYPE_CHECKING
 import cyclonedds.idl.types as t
 from cyclonedds.idl import IdlStruct
 
+from firmware_bridge.unitree.messages.binding import Octet
+
 # mypy cannot read `t.array[...]`: it sees plain sequences, the CDR code sees the lengths.
 if TYPE_CHECKING:
     OctetSequence = Sequence[int]
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     F32x4 = Sequence[float]
     I16x4 = Sequence[int]
 else:
-    OctetSequence = t.sequence[t.byte]
+    OctetSequence = t.sequence[Octet]
     F32x12 = t.array[t.float32, 12]
     F32x3 = t.array[t.float32, 3]
     F32x4 = t.array[t.float32, 4]
@@ -92,7 +92,7 @@ class IMUState_(IdlStruct, typename="unitree_go.msg.dds_.IMUState_"):
     gyroscope: F32x3
     accelerometer: F32x3
     rpy: F32x3
-    temperature: t.byte
+    temperature: Octet
 
 
 @dataclass
@@ -117,9 +117,9 @@ class SportModeState_(IdlStruct, typename="unitree_go.msg.dds_.SportModeState_")
     stamp: TimeSpec_
     error_code: t.uint32
     imu_state: IMUState_
-    mode: t.byte
+    mode: Octet
     progress: t.float32
-    gait_type: t.byte
+    gait_type: Octet
     foot_raise_height: t.float32
     position: F32x3
     body_height: t.float32

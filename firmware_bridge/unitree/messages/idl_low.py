@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import cyclonedds.idl.types as t
 from cyclonedds.idl import IdlStruct
 
+from firmware_bridge.unitree.messages.binding import Octet
 from firmware_bridge.unitree.messages.idl import I16x4, IMUState_
 
 if TYPE_CHECKING:
@@ -18,8 +19,8 @@ if TYPE_CHECKING:
     U16x4 = Sequence[int]
     U32x2 = Sequence[int]
 else:
-    Octets2 = t.array[t.byte, 2]
-    Octets40 = t.array[t.byte, 40]
+    Octets2 = t.array[Octet, 2]
+    Octets40 = t.array[Octet, 40]
     U16x15 = t.array[t.uint16, 15]
     U16x4 = t.array[t.uint16, 4]
     U32x2 = t.array[t.uint32, 2]
@@ -27,7 +28,7 @@ else:
 
 @dataclass
 class MotorState_(IdlStruct, typename="unitree_go.msg.dds_.MotorState_"):
-    mode: t.byte
+    mode: Octet
     q: t.float32
     dq: t.float32
     ddq: t.float32
@@ -35,7 +36,7 @@ class MotorState_(IdlStruct, typename="unitree_go.msg.dds_.MotorState_"):
     q_raw: t.float32
     dq_raw: t.float32
     ddq_raw: t.float32
-    temperature: t.byte
+    temperature: Octet
     lost: t.uint32
     reserve: U32x2
 
@@ -48,10 +49,10 @@ else:
 
 @dataclass
 class BmsState_(IdlStruct, typename="unitree_go.msg.dds_.BmsState_"):
-    version_high: t.byte
-    version_low: t.byte
-    status: t.byte
-    soc: t.byte
+    version_high: Octet
+    version_low: Octet
+    status: Octet
+    soc: Octet
     current: t.int32
     cycle: t.uint16
     bq_ntc: Octets2
@@ -62,8 +63,8 @@ class BmsState_(IdlStruct, typename="unitree_go.msg.dds_.BmsState_"):
 @dataclass
 class LowState_(IdlStruct, typename="unitree_go.msg.dds_.LowState_"):
     head: Octets2
-    level_flag: t.byte
-    frame_reserve: t.byte
+    level_flag: Octet
+    frame_reserve: Octet
     sn: U32x2
     version: U32x2
     bandwidth: t.uint16
@@ -74,10 +75,10 @@ class LowState_(IdlStruct, typename="unitree_go.msg.dds_.LowState_"):
     foot_force_est: I16x4
     tick: t.uint32
     wireless_remote: Octets40
-    bit_flag: t.byte
+    bit_flag: Octet
     adc_reel: t.float32
-    temperature_ntc1: t.byte
-    temperature_ntc2: t.byte
+    temperature_ntc1: Octet
+    temperature_ntc2: Octet
     power_v: t.float32
     power_a: t.float32
     fan_frequency: U16x4

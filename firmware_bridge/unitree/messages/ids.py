@@ -75,7 +75,7 @@ LAST_MODE: Final = 13  # front pounce
 
 
 def request_topic(service: str) -> str:
-    """DDS topic on which `service` takes its requests."""
+    """Return the DDS topic on which `service` receives requests."""
     return f"rt/api/{service}/request"
 
 

@@ -59,7 +59,7 @@ class Snapshot:
 
     @property
     def boot_us(self) -> int:
-        """Time since switch-on, us."""
+        """Return the time since switch-on, us."""
         return round(self.stamp_s * 1e6)
 
     @property

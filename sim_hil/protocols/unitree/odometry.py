@@ -47,7 +47,7 @@ class OdometryFrame:
         return wz_radps
 
     def update(self, truth: RobotTruth) -> None:
-        """Advance to a new instant, before its messages are made; exact odometry does nothing."""
+        """Advance the drift to a new instant, before its messages are built. Exact odometry has no drift."""
 
 
 def turned_quaternion(wxyz: list[float], yaw_rad: float) -> list[float]:

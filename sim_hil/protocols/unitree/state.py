@@ -16,6 +16,7 @@ from cyclonedds.pub import DataWriter
 
 from firmware_bridge.unitree.dds import DDS_ERRORS, Bus
 from firmware_bridge.unitree.messages import ids
+from firmware_bridge.unitree.messages.binding import has_reader
 from firmware_bridge.unitree.messages.crc import LOW_STATE_LAYOUT, crc_of_words, low_state_values
 from firmware_bridge.unitree.messages.idl import IMUState_, PathPoint_, SportModeState_, TimeSpec_, WirelessController_
 from firmware_bridge.unitree.messages.idl_low import BmsState_, LowState_, MotorState_
@@ -191,7 +192,7 @@ class _Periodic:
         if self._always:
             return step % self._every == 0
         if step % self._check_every == 0:
-            self._wanted = bool(self._writer.get_matched_subscriptions())
+            self._wanted = has_reader(self._writer)
         return self._wanted and step % self._every == 0
 
     def write(self, message: object) -> None:

@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-import tomllib
 
 import edge.core.cli
 import edge.deploy.doctor.command
@@ -25,6 +24,7 @@ import firmware_bridge.bridge
 import sim_hil.layouts.__main__
 import tools.bench.governor
 import tools.train.cli
+from edge import commands
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_REFUSED, OutputError, write_result
 from firmware_bridge import output_file
 
@@ -266,17 +266,6 @@ def test_no_command_writes_to_a_named_output_by_itself(path: Path) -> None:
             assert ast.unparse(written) not in named, ast.unparse(call)
 
 
-SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["scripts"]
-BEHIND = {  # entry modules that import the command only when its packages are installed
-    "export.entry": "export.cli",
-    "sim_hil.hil.entry": "sim_hil.hil.command",
-    "sim_hil.benchmark.entry": "sim_hil.benchmark.cli",
-    "sim_hil.soak.entry": "sim_hil.soak.cli",
-    "tools.train.pipeline.entry": "tools.train.cli",
-}
-
-
-@pytest.mark.parametrize("script", sorted(set(SCRIPTS) - {"edge-bridge"}))  # which imports nothing of edge
-def test_every_console_script_is_such_a_command(script: str) -> None:
-    module = SCRIPTS[script].partition(":")[0]
-    assert hasattr(importlib.import_module(BEHIND.get(module, module)).main, "__wrapped__")
+@pytest.mark.parametrize("command", commands.COMMANDS)
+def test_every_console_script_is_such_a_command(command: str) -> None:
+    assert hasattr(importlib.import_module(commands.COMMANDS[command][0]).main, "__wrapped__")

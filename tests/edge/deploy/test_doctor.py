@@ -27,8 +27,7 @@ from edge.inference.graph import CPU_PROVIDER
 from export.targets.file import load_target
 from firmware_bridge.core.config import RobotConfig, load_robot_config
 from firmware_bridge.core.link import BridgeStatus
-from firmware_bridge.unitree.client import CameraError
-from firmware_bridge.unitree.dds import DdsError
+from firmware_bridge.core.robot_state import CameraError, DdsError
 from tests.support.processes import GO2_SIM
 
 PLAN = PlanFacts(100.0, 60.0, 40.0, 0.2, 1100, 4 * GIB, "modelled")

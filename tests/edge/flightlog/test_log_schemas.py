@@ -14,7 +14,7 @@ from edge.flightlog.part import encode
 from edge.flightlog.records import Throttle, battery_record, odometry_record
 from edge.flightlog.schemas import SCHEMAS, Schema
 from edge.odometry.drift_rate import DriftRate
-from firmware_bridge.unitree.messages.state import BatteryState, RobotState
+from firmware_bridge.core.robot_state import BatteryState, RobotState
 from tests.support.runner import synthetic_run
 
 _TYPES: dict[str, tuple[type, ...]] = {

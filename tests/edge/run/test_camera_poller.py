@@ -11,7 +11,7 @@ import pytest
 from edge.odometry.visual_odometry import grey_frame
 from edge.run.camera import CameraPoller, decode_frame
 from edge.state.frame import fit_frame
-from firmware_bridge.unitree.client import CameraError
+from firmware_bridge.core.robot_state import CameraError
 
 MS = 1_000_000
 

@@ -20,8 +20,9 @@ from edge.run.robot_inputs import RobotInputs
 from edge.safety.faults.table import FAULTS
 from edge.state.frame import Frame
 from firmware_bridge.core.config import load_robot_config
+from firmware_bridge.core.robot_state import CameraError, RobotState
 from firmware_bridge.unitree import client
-from firmware_bridge.unitree.client import CameraError, Go2Reader, RobotState
+from firmware_bridge.unitree.client import Go2Reader
 from sim_hil.protocols.unitree.state import LowStateMessage
 from tests.firmware_bridge.unitree.test_unitree_rpc import GO2_SIM
 from tests.support.runner.control_bench import MS, PERIOD_NS, Bench

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from export import entry
 from export.cli import main
 from export.pipeline.build import with_exceptions
 from export.quantize.precision import Precision
@@ -17,17 +16,6 @@ from tests.support.export.export_job import manifest
 LOOSE = [
     f"--set=gates.vision_encoder.{key}" for key in ("min_cosine=0.9", "warn_cosine=0.9", "max_abs=10")
 ]  # for an encoder that is rounded
-
-
-def test_an_interrupt_while_modules_load_is_no_traceback(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted(*_: str) -> int:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(entry, "run_with_extra", interrupted)
-    assert entry.main() == 130
-    assert capsys.readouterr().err == "edge-export: interrupted\n"
 
 
 @pytest.mark.parametrize(

@@ -19,11 +19,12 @@ import re, sys, time
 from pathlib import Path
 from firmware_bridge.core.config import DdsConfig
 from firmware_bridge.unitree.dds import Bus
+from firmware_bridge.unitree.messages.binding import has_reader
 from firmware_bridge.unitree.messages.idl import Request_
 bus = Bus(DdsConfig(int(sys.argv[1]), "lo", ("127.0.0.1",)))
 for line in sys.stdin:
     writer = bus.writer(line.strip(), Request_)
-    while not writer.get_matched_subscriptions():
+    while not has_reader(writer):
         time.sleep(0.005)
     print(re.search(r"Rss: +(\\d+) kB", Path("/proc/self/smaps_rollup").read_text())[1], flush=True)
 """

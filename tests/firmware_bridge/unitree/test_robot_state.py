@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from firmware_bridge.core.robot_state import BatteryState, RobotState, StampOrder
 from firmware_bridge.unitree.messages.idl import SportModeState_, TimeSpec_
-from firmware_bridge.unitree.messages.state import BatteryState, RobotState, StampOrder, battery_state, robot_state
+from firmware_bridge.unitree.report import battery_state, robot_state
 from sim_hil.protocols.unitree.odometry import OdometryFrame
 from sim_hil.protocols.unitree.state import LowStateMessage, sport_mode_state
 from tests.support.robot.fake_go2 import standing

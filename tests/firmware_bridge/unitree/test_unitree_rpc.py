@@ -15,8 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_bridge.core.config import DdsConfig, load_robot_config
-from firmware_bridge.unitree.client import CameraError, Go2Reader, RobotState, robot_state
-from firmware_bridge.unitree.dds import Bus, DdsError, domain_xml
+from firmware_bridge.core.robot_state import CameraError, DdsError, RobotState
+from firmware_bridge.unitree.client import Go2Reader
+from firmware_bridge.unitree.dds import Bus, domain_xml
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.messages.idl import (
     RequestIdentity_,
@@ -26,6 +27,7 @@ from firmware_bridge.unitree.messages.idl import (
     SportModeState_,
 )
 from firmware_bridge.unitree.messages.idl_low import LowState_
+from firmware_bridge.unitree.report import robot_state
 from firmware_bridge.unitree.rpc import MAX_BINARY_BYTES, Response, RpcClient, RpcError
 from sim_hil.protocols.unitree.odometry import OdometryFrame
 from sim_hil.protocols.unitree.services.service import ServiceServer

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from firmware_bridge.core.config import BridgeConfig, LimitsConfig, SafetyConfig
 from firmware_bridge.core.link import Arm, BridgeStatus, Velocity
+from firmware_bridge.core.robot_state import RobotState
 from firmware_bridge.core.rules import BridgeCore
 from firmware_bridge.core.step_types import Call, Inputs, Move, Outputs, Report
 from firmware_bridge.unitree.messages import ids
-from firmware_bridge.unitree.messages.state import RobotState
 
 MS = 1_000_000
 BRIDGE = BridgeConfig(Path("/nowhere/bridge.sock"))

@@ -1,6 +1,6 @@
 """Low command message, for the simulated robot only: code that commands a real robot must not be able to decode it.
 
-Type and member names are those of the wire; every octet is `byte`, see firmware_bridge/unitree/messages/idl.py.
+Type and member names are those of the wire; octets: see firmware_bridge/unitree/messages/binding.py.
 """
 
 # ruff: noqa: N801 - the names are the wire's type names
@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 import cyclonedds.idl.types as t
 from cyclonedds.idl import IdlStruct
 
+from firmware_bridge.unitree.messages.binding import Octet
+
 if TYPE_CHECKING:
     Octets2 = Sequence[int]
     Octets3 = Sequence[int]
@@ -20,17 +22,17 @@ if TYPE_CHECKING:
     U32x2 = Sequence[int]
     U32x3 = Sequence[int]
 else:
-    Octets2 = t.array[t.byte, 2]
-    Octets3 = t.array[t.byte, 3]
-    Octets12 = t.array[t.byte, 12]
-    Octets40 = t.array[t.byte, 40]
+    Octets2 = t.array[Octet, 2]
+    Octets3 = t.array[Octet, 3]
+    Octets12 = t.array[Octet, 12]
+    Octets40 = t.array[Octet, 40]
     U32x2 = t.array[t.uint32, 2]
     U32x3 = t.array[t.uint32, 3]
 
 
 @dataclass
 class MotorCmd_(IdlStruct, typename="unitree_go.msg.dds_.MotorCmd_"):
-    mode: t.byte
+    mode: Octet
     q: t.float32
     dq: t.float32
     tau: t.float32
@@ -47,15 +49,15 @@ else:
 
 @dataclass
 class BmsCmd_(IdlStruct, typename="unitree_go.msg.dds_.BmsCmd_"):
-    off: t.byte
+    off: Octet
     reserve: Octets3
 
 
 @dataclass
 class LowCmd_(IdlStruct, typename="unitree_go.msg.dds_.LowCmd_"):
     head: Octets2
-    level_flag: t.byte
-    frame_reserve: t.byte
+    level_flag: Octet
+    frame_reserve: Octet
     sn: U32x2
     version: U32x2
     bandwidth: t.uint16
@@ -64,6 +66,6 @@ class LowCmd_(IdlStruct, typename="unitree_go.msg.dds_.LowCmd_"):
     wireless_remote: Octets40
     led: Octets12
     fan: Octets2
-    gpio: t.byte
+    gpio: Octet
     reserve: t.uint32
     crc: t.uint32

@@ -11,7 +11,7 @@ import pytest
 from firmware_bridge.unitree.dds import Bus, take_each
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.messages.idl import SportModeState_
-from firmware_bridge.unitree.messages.state import robot_state
+from firmware_bridge.unitree.report import robot_state
 from firmware_bridge.unitree.rpc import RpcClient, move_parameter
 from sim_hil.protocols.unitree import front_end
 from sim_hil.protocols.unitree.front_end import UnitreeFrontEnd, open_front_end

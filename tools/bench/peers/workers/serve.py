@@ -45,7 +45,7 @@ class Load:
         return {key.partition(".")[2]: v for key, v in self.options.items() if key.startswith(part + ".")}
 
     def folder(self, runtime: str, part: str) -> Path:
-        """Where `models.prepare` has put a runtime's model of a part, in the form that the options name."""
+        """Return the folder in which `models.prepare` has put a runtime's model of a part, in the options' form."""
         return self.cache / self.model / runtime / f"{part}-{self.options[part + '.form']}"
 
 

@@ -1,0 +1,41 @@
+"""`edge-export verify DIR` on a robot's computer, which has no torch: hashes, contract, and one run of every graph.
+
+The gates compare with torch; they belong to the computer that exports.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from edge.artifacts.files import ArtifactError
+from edge.artifacts.manifest import load_artifacts
+from edge.core.cli import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_REFUSED, command_line
+from edge.deploy.doctor.check import Level
+from edge.deploy.doctor.graphs import profile_graph
+from edge.inference import engines
+
+
+@command_line("edge-export")
+def main(argv: Sequence[str] | None = None) -> int:
+    """Verify an artifact directory without torch; returns the exit code."""
+    parser = argparse.ArgumentParser("edge-export", description=__doc__)
+    parser.add_argument("verify", choices=["verify"], help=argparse.SUPPRESS)
+    parser.add_argument("directory", type=Path, metavar="DIR", help="artifact directory")
+    args = parser.parse_args(argv)
+    try:
+        artifacts = load_artifacts(args.directory.absolute())
+        if engines.needed(artifacts):
+            folder = engines.default_directory(artifacts.directory)
+            engines.check(artifacts, folder)
+            artifacts = engines.with_engines(artifacts, folder)
+    except (ArtifactError, engines.EngineError) as error:
+        sys.stderr.write(f"edge-export: {error}\n")
+        return EXIT_REFUSED
+    checks = [profile_graph(artifacts, name) for name in artifacts.graphs]
+    for check in checks:
+        sys.stderr.write(f"edge-export: {check.name}: {check.found}\n")
+    sys.stderr.write("edge-export: hashes and contract hold; the gates were not repeated: torch is not installed\n")
+    return EXIT_CHECK_FAILED if any(check.level is Level.FAIL for check in checks) else EXIT_DONE
