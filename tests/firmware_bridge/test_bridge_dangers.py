@@ -176,16 +176,20 @@ class TestIdentity:
         assert bench.status.cause == "wrong_robot"
 
 
-class TestSecondCommander:
-    def test_arming_is_refused_until_it_has_been_quiet_for_two_seconds(self) -> None:
-        bench = Bench().arm()
-        _foreign(bench)
-        bench.wait(1900)
-        bench.ask_to_arm()
-        assert bench.status.cause == "second_commander"
-        bench.wait(200)
-        bench.arm()
+@pytest.mark.parametrize(
+    ("danger", "cause", "quiet_ms"), [(_foreign, "second_commander", 2000), (_stick, "remote_takeover", 1000)]
+)
+def test_arming_is_refused_until_the_other_commander_has_been_quiet(danger, cause: str, quiet_ms: int) -> None:
+    bench = Bench().arm()
+    danger(bench)
+    bench.wait(quiet_ms - 100)
+    bench.ask_to_arm()
+    assert (bench.status.state, bench.status.cause) == ("stopped", cause)
+    bench.wait(200)
+    bench.arm()
 
+
+class TestSecondCommander:
     def test_other_commanders_of_a_disarmed_robot_are_ignored(self) -> None:
         bench = Bench()
         for _ in range(50):
@@ -210,15 +214,6 @@ class TestRemote:
         bench = Bench().arm()
         bench.step(remote_in_use=False)
         assert bench.status.state == "armed"
-
-    def test_arming_is_refused_until_it_has_been_left_alone_for_a_second(self) -> None:
-        bench = Bench().arm()
-        _stick(bench)
-        bench.wait(900)
-        bench.ask_to_arm()
-        assert bench.status.state == "stopped"
-        bench.wait(200)
-        bench.arm()
 
 
 class TestStopAgain:

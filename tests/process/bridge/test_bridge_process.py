@@ -79,12 +79,16 @@ def test_a_dead_or_frozen_runner_leaves_zero_on_the_wire(robot: FakeGo2, drive: 
 
 
 @pytest.mark.slow
-def test_a_frozen_runner_that_thaws_does_not_drive_again(robot: FakeGo2, drive: Drive) -> None:
+@pytest.mark.parametrize("frozen", ["runner", "bridge"])
+def test_a_process_that_was_frozen_does_not_drive_on(
+    robot: FakeGo2, bridge: Running, drive: Drive, frozen: str
+) -> None:
     with drive() as runner:
-        os.kill(runner.pid, signal.SIGSTOP)
-        time.sleep(0.5)
+        pid = runner.pid if frozen == "runner" else bridge.pid
+        os.kill(pid, signal.SIGSTOP)
+        time.sleep(0.6)
         robot.received.clear()
-        os.kill(runner.pid, signal.SIGCONT)
+        os.kill(pid, signal.SIGCONT)
         time.sleep(0.5)
         assert robot.moves() and all(command.velocity == ZERO for command in robot.moves())
 
@@ -262,17 +266,6 @@ def test_a_killed_bridges_successor_stops_the_moving_robot_first(
         wait_for_request(robot, ids.STOP_MOVE)
         assert robot.received[0].velocity == ZERO
         wait_for(lambda: "the robot was moving" in successor.stderr(), 5, "the reason")
-
-
-@pytest.mark.slow
-def test_a_bridge_that_was_frozen_does_not_drive_on(robot: FakeGo2, bridge: Running, drive: Drive) -> None:
-    with drive():
-        os.kill(bridge.pid, signal.SIGSTOP)
-        time.sleep(0.6)
-        robot.received.clear()
-        os.kill(bridge.pid, signal.SIGCONT)
-        time.sleep(0.5)
-        assert robot.moves() and all(command.velocity == ZERO for command in robot.moves())
 
 
 def test_another_robot_than_the_files_is_not_armed(robot: FakeGo2, bridge: Running, socket_path: Path) -> None:
