@@ -107,9 +107,14 @@ def test_a_soak_without_measurements_is_undecided_with_exit_code_1(
 
 @pytest.mark.parametrize(
     ("measure", "lines", "message"),
-    [("stops", "max = 1.0\nmin = 0.0", None), ("stops", "", None), ("stops", "max = nan", None), ("stops", "most = 1.0", None),
-     ("y", "max = 1.0", "no measure 'y'")],
-)  # fmt: skip
+    [
+        ("stops", "max = 1.0\nmin = 0.0", None),
+        ("stops", "", None),
+        ("stops", "max = nan", None),
+        ("stops", "most = 1.0", None),
+        ("y", "max = 1.0", "no measure 'y'"),
+    ],
+)
 def test_a_wrong_budget_is_refused(tmp_path: Path, measure: str, lines: str, message: str | None) -> None:
     path = tmp_path / "budget.toml"
     path.write_text(f'format = 1\n[[budget]]\nmeasure = "{measure}"\nsource = "here"\n{lines}\n', encoding="utf-8")
