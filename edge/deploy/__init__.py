@@ -1,1 +1,1 @@
-"""`edge-install`: prepares a device for the runner: engines, systemd units and their checks."""
+"""`edge-install`: prepares a device for the runner: releases, DDS binding, engines, systemd units and their checks."""

@@ -175,7 +175,8 @@ def _build_steps(args: argparse.Namespace, system: System, prefix: Path, pip: li
         raise BindingError("there is no compiler: sudo apt-get install gcc libc6-dev; then run this again")
     if not system.python_header.is_file():
         raise BindingError(f"{system.python_header} is missing: sudo apt-get install python3-dev; then run this again")
-    environment = {"CYCLONEDDS_HOME": str(prefix)}
+    # The compiled part of the binding must find a library that no system folder has.
+    environment = {"CYCLONEDDS_HOME": str(prefix), "LDFLAGS": f"-Wl,-rpath,{prefix / 'lib'}"}
     # The source archive's own build script fails with newer versions of setuptools.
     tools = Step("install the build tools of the binding", [*pip, "setuptools<70", "wheel"], {})
     pinned = prefix.parent / f"{prefix.name}.requirement.txt"

@@ -20,7 +20,7 @@ from edge.core.cli import (
     messages,
     write_result,
 )
-from edge.deploy import dds_binding, install_units
+from edge.deploy import board, dds_binding, install_units
 from edge.deploy.unit_text import UnitError
 from edge.inference import engines
 from edge.reasoning.prompt import InstructionError
@@ -33,12 +33,14 @@ EXAMPLES = """examples:
   sudo edge-install units --artifacts /opt/tic-vla/orin --robot /etc/tic-vla/go2.toml --target orin \\
        --instruction-file /etc/tic-vla/instruction.txt --network 192.168.123.161/32 --system
   edge-install dds
+  sudo edge-install board --wheel tic_vla_edge-0.1.0-py3-none-any.whl --artifacts out/cpu --extras cpu,unitree
+  sudo edge-install rollback
 
 units needs a robot file with operator_arm = true in [safety], or --arm-at-start. An interrupted build of engines keeps
 the finished ones: run it again to go on.
 
-exit codes: 0 done, 1 systemd finds fault with the units, 2 bad arguments or input, 3 refused (artifacts, device),
-            130 interrupted
+exit codes: 0 done, 1 a step failed or systemd finds fault with the units, 2 bad arguments or input,
+            3 refused (artifacts, device), 130 interrupted
 """
 
 
@@ -61,6 +63,7 @@ def parser() -> argparse.ArgumentParser:
     )
     install_units.add_arguments(service)
     dds_binding.add_arguments(commands.add_parser("dds", help="install a Cyclone DDS binding that works on this board"))
+    board.add_parsers(commands)
     return p
 
 
@@ -82,6 +85,8 @@ def main(
     args = parser().parse_args(argv)
     if args.command == "dds":
         return dds_binding.run(args, _print)
+    if args.command in board.COMMANDS:
+        return board.run(args, _print)
     check_result_target(args.json)
     if args.command == "units":
         return install_units.run(args, _print, host)

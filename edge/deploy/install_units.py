@@ -8,7 +8,7 @@ import shutil
 import socket
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from ipaddress import AddressValueError, IPv4Address, IPv4Network, NetmaskValueError
 from pathlib import Path
 from stat import S_IROTH, S_IXOTH
@@ -23,6 +23,7 @@ from edge.artifacts.target_facts import TargetFacts, target_facts
 from edge.artifacts.trust import STATE_DIRECTORY, Trust
 from edge.core.cli import EXIT_CHECK_FAILED, EXIT_DONE, write_result, write_whole
 from edge.deploy import units
+from edge.deploy.releases import LINK
 from edge.deploy.unit_check import MAX_EXPOSURE, UnitVerdict, check_units, systemd_version
 from edge.deploy.unit_text import (
     BRIDGE_USER,
@@ -86,6 +87,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     place = parser.add_mutually_exclusive_group(required=True)
     place.add_argument("--out", type=Path, metavar="DIR", help="write the files here, to be read or copied")
     place.add_argument("--system", action="store_true", help="write them to where systemd reads them (needs root)")
+    parser.add_argument(
+        "--home", type=Path, metavar="DIR",
+        help="run the release that DIR/current leads to (edge-install board), instead of this installation",
+    )  # fmt: skip
     parser.add_argument("--target", metavar="NAME", help="refuse artifacts of any other target")
     parser.add_argument("--engines", type=Path, metavar="DIR", help="engines (default: ARTIFACTS.engines)")
     parser.add_argument("--trust", type=Path, metavar="KEY.pub", help="run only artifacts that this key has signed")
@@ -119,6 +124,8 @@ def run(args: argparse.Namespace, say: Callable[[str], None], host: Host | None 
     to be refused.
     """
     host = host or Host()
+    if args.home is not None:
+        host = of_release(host, args.home.absolute())
     inputs = gather(args, host)
     if set(inputs.providers) & set(units.NEED_DEVICES) and not inputs.devices:
         lacking = "no device of " + " or ".join(inputs.providers) + " is on this machine"
@@ -167,6 +174,12 @@ def run(args: argparse.Namespace, say: Callable[[str], None], host: Host | None 
     return EXIT_DONE if verdict.good else EXIT_CHECK_FAILED
 
 
+def of_release(host: Host, home: Path) -> Host:
+    """Return the machine with the programs of the current release, which an update or a rollback changes."""
+    programs = home / LINK / "venv/bin"
+    return replace(host, programs=programs, python=programs / "python", prefixes=(home, Path(sys.base_prefix)))
+
+
 def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
     """Everything that the units depend on, from the arguments, the artifacts, the robot file and the machine."""
     robot = load_robot_config(args.robot, socket=units.SOCKET)
@@ -175,7 +188,9 @@ def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
             f"robot file {args.robot}: safety.operator_arm: expected true, found false: the service would drive as "
             f"soon as it starts; set it to true, or give --arm-at-start if you want that"
         )
-    artifacts = load_artifacts(args.artifacts.resolve())
+    # A path through the link of the releases stays one, so that an update changes programs and artifacts together.
+    through_link = args.home is not None and args.artifacts.absolute().is_relative_to(args.home.absolute() / LINK)
+    artifacts = load_artifacts(args.artifacts.absolute() if through_link else args.artifacts.resolve())
     if args.trust is not None:
         Trust(args.trust, STATE_DIRECTORY / "release.json").check(
             artifacts.directory, read_manifest_bytes(artifacts.directory)
@@ -194,7 +209,8 @@ def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
     nodes = device_nodes(providers, host.root)
     folder = None
     if engines.needed(artifacts):
-        folder = (args.engines or engines.default_directory(artifacts.directory)).resolve()
+        folder = args.engines or engines.default_directory(artifacts.directory)
+        folder = folder if through_link and args.engines is None else folder.resolve()
     return units.ServiceInputs(
         programs=host.programs,
         python=host.python,

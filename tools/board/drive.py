@@ -56,18 +56,20 @@ def drive(root: Path, out: Path, domain: int) -> dict[str, Any]:
             for process in (gate, robot):
                 process.send_signal(signal.SIGINT)
                 process.wait(30)
-    return {**judge(trace.read_text(), silent_ns), "bridge_rss_mb": rss_mb, "bridge_exit_code": gate.returncode}
+    found = {**judge(trace.read_text(), silent_ns), "bridge_rss_mb": rss_mb, "bridge_exit_code": gate.returncode}
+    if not (found["at_rest"] and found["last_command_is_zero"] and gate.returncode == 0):
+        raise DriveError(f"the drive did not end at rest with a zero and exit code 0: {found}")
+    return found
 
 
 def judge(trace: str, silent_ns: int) -> dict[str, Any]:
     """Return what the simulated robot's trace says: metres walked, time from the last command to rest, last command."""
     records = [json.loads(line) for line in trace.splitlines()]
     end = next((record for record in records if record["kind"] == "end"), None)
-    if end is None or end["path_m"] < 0.5:
+    poses = [record for record in records if record["kind"] == "pose" and record["t_ns"] > silent_ns]
+    if end is None or end["path_m"] < 0.5 or not poses:
         raise DriveError("the robot has not walked: see bridge.log and robot.log")
-    speeds = [
-        (r["t_ns"], math.hypot(r["vx"], r["vy"])) for r in records if r["kind"] == "pose" and r["t_ns"] > silent_ns
-    ]
+    speeds = [(pose["t_ns"], math.hypot(pose["vx"], pose["vy"])) for pose in poses]
     moving_ns = max((t_ns for t_ns, speed in speeds if speed >= REST_MPS), default=silent_ns)
     return {
         "path_m": end["path_m"],

@@ -85,7 +85,8 @@ def test_arm64_compiles_the_pinned_source_against_the_packages(tmp_path: Path) -
     code, lines = install(machine, tmp_path)
     assert code == 0 and lines[-1] == "cyclonedds 0.10.5 works"
     assert (tmp_path / "prefix.requirement.txt").read_text() == f"{BINDING} --hash=sha256:{BINDING_SHA256}\n"
-    assert machine.environments[1] == {"CYCLONEDDS_HOME": str(tmp_path / "prefix")}
+    assert machine.environments[1]["CYCLONEDDS_HOME"] == str(tmp_path / "prefix")
+    assert str(tmp_path / "prefix/lib") in machine.environments[1]["LDFLAGS"]
     assert (tmp_path / "prefix/lib/libddsc.so").resolve().name == "libddsc.so.0.10.2"
 
 

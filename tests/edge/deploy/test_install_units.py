@@ -93,6 +93,20 @@ def test_it_writes_both_units_and_the_user_and_prints_the_start_command(units: U
     assert "drives after `edge-bridge arm` only" in text and "--arm-at-start" not in text
 
 
+def test_services_of_a_board_follow_its_current_release(units: Units, artifacts_dir: Path, tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    release = home / "releases/3"
+    (release / "venv").mkdir(parents=True)
+    shutil.copytree(tmp_path / "bin", release / "venv/bin")
+    shutil.copytree(artifacts_dir, release / "artifacts")
+    (home / "current").symlink_to("releases/3")
+    assert units("--home", str(home), artifacts=home / "current/artifacts")[0] == EXIT_DONE
+    for unit in (BRIDGE_UNIT, RUNNER_UNIT):
+        text = (tmp_path / "units" / unit).read_text()
+        assert f"{home}/current/venv/bin/edge-" in text and "releases/3" not in text
+    assert f"{home}/current/artifacts" in text
+
+
 def test_the_emergency_stop_of_this_service_is_printed(
     units: Units, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
