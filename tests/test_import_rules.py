@@ -102,7 +102,7 @@ def test_every_folder_has_its_floor_and_every_floor_its_folder() -> None:
 
 
 @pytest.mark.parametrize("folder", PACKAGE_FOLDERS, ids=ids)
-def test_a_folder_says_what_lives_there_and_stays_small(folder: Path) -> None:
+def test_a_folder_has_a_docstring_and_stays_small(folder: Path) -> None:
     init = folder / "__init__.py"
     assert init.is_file() and ast.get_docstring(ast.parse(init.read_text(encoding="utf-8"))), f"{ids(init)}: docstring"
     modules = [path for path in folder.glob("*.py") if path != init]

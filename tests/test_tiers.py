@@ -20,6 +20,6 @@ def test_a_module_that_starts_commands_in_real_time_runs_alone(module: Path) -> 
     assert not STARTS.search(text) or MARKED.search(text)
 
 
-def test_nobody_else_gets_a_dds_domain_that_is_claimed() -> None:
+def test_a_claimed_dds_domain_is_given_once() -> None:
     with claimed_dds_domain() as one, claimed_dds_domain() as other:
         assert one != other

@@ -52,7 +52,7 @@ def test_a_log_becomes_a_profile_that_the_benchmark_reads(flight_log: Path, tmp_
     assert result["generations"] == 30 and result["mean_s"] == pytest.approx(1.5) and result["tagged"] == "measured"
 
 
-def test_a_scaled_profile_has_that_mean_and_says_that_it_is_modelled(flight_log: Path, tmp_path: Path) -> None:
+def test_a_scaled_profile_has_the_requested_mean_and_is_marked_modelled(flight_log: Path, tmp_path: Path) -> None:
     out = tmp_path / "profile.json"
     assert run("--log", flight_log, "--scale-to-mean", 3, "--out", out) == EXIT_DONE
     profile = load_profile(out)
@@ -67,7 +67,7 @@ def test_a_mean_that_no_profile_has_is_refused(mean_s: float) -> None:
         LatencyProfile("n", "s", (1.0,)).scaled_to_mean(mean_s)
 
 
-def test_a_profile_says_whether_it_was_measured_or_is_modelled() -> None:
+def test_a_profile_is_marked_measured_or_modelled() -> None:
     content = {"schema": 1, "name": "n", "source": "s", "generation_s": [1.0]}
     assert LatencyProfile.of_json(content).tagged == "modelled"
     assert LatencyProfile.of_json({**content, "tagged": "measured"}).tagged == "measured"
@@ -99,7 +99,7 @@ def test_too_few_generations_make_no_profile(tmp_path: Path, capsys: Any) -> Non
         (("--log", "x.json", "--out", "p.json", "--instruction", ""), "instruction"),
     ],
 )
-def test_what_makes_no_sense_is_one_line(
+def test_invalid_arguments_are_refused_in_one_line(
     arguments: tuple[str, ...], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
     monkeypatch.chdir(tmp_path)

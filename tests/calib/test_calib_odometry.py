@@ -65,7 +65,7 @@ def test_a_known_scale_and_bias_are_found(known: tuple[Path, Path], tmp_path: Pa
     assert math.degrees(found.gyro_bias_radps) == pytest.approx(0.3, abs=0.05)
 
 
-def test_what_the_drive_does_not_show_stays_as_uncertain_as_before(known: tuple[Path, Path], tmp_path: Path) -> None:
+def test_parameters_that_the_drive_does_not_excite_stay_uncertain(known: tuple[Path, Path], tmp_path: Path) -> None:
     log, truth = known
     out = tmp_path / "robot.odometry.toml"
     main(["odometry", str(log), "--truth", str(truth), "--out", str(out)])
@@ -106,14 +106,14 @@ def test_a_drive_too_short_to_tell_is_not_written(tmp_path: Path, capsys: pytest
     assert "not good enough" in capsys.readouterr().err
 
 
-def test_odometry_that_has_nothing_to_do_with_the_truth_is_not_explained(tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
+def test_odometry_unrelated_to_the_truth_is_not_fitted(tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
     log = write_log(tmp_path / "d.mcap", drive(26, wz_radps=0.1))
     truth = write_truth(tmp_path / "t.jsonl", drive(26, wz_radps=-0.5, vx_mps=0.2))
     assert main(["odometry", str(log), "--truth", str(truth)]) == 1
     assert "do not describe the same drive" in capsys.readouterr().err
 
 
-def test_an_interrupted_calibration_says_so(
+def test_an_interrupted_calibration_reports_the_interrupt(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def interrupt(_path: Path) -> None:
@@ -125,17 +125,17 @@ def test_an_interrupted_calibration_says_so(
 
 
 @pytest.mark.parametrize(
-    ("make", "says"),
+    ("make", "message"),
     [
         (lambda folder: folder / "missing.mcap", "No such file"),
         (lambda folder: _text(folder / "a.mcap", "not a log"), "not an MCAP file"),
         (lambda folder: write_log(folder / "b.mcap", drive(1)), "expected at least 100"),
     ],
 )
-def test_a_log_that_cannot_be_used_is_one_clear_line(make, says: str, tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
+def test_a_log_that_cannot_be_used_is_one_clear_line(make, message: str, tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
     assert main(["odometry", str(make(tmp_path)), "--truth", str(tmp_path / "t.jsonl")]) == 2
     error = capsys.readouterr().err
-    assert says in error and error.count("\n") == 1
+    assert message in error and error.count("\n") == 1
 
 
 def test_without_camera_and_truth_there_is_nothing_to_compare_with(tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
@@ -162,7 +162,7 @@ def test_a_calibration_reads_back_as_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         (lambda text: text + "colour = 1.0\n", "unknown key colour"),
         (lambda text: text.replace("scale_x = ", "# "), "missing key scale_x"),
@@ -172,10 +172,10 @@ def test_a_calibration_reads_back_as_written(tmp_path: Path) -> None:
         (lambda text: text + "[", "cannot be read"),
     ],
 )
-def test_a_calibration_that_cannot_be_used_is_refused(change, says: str, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_a_calibration_that_cannot_be_used_is_refused(change, message: str, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     path = tmp_path / "c.toml"
     path.write_text(change(calibration_text(OdometryCalibration(), "a test")))
-    with pytest.raises(CalibrationError, match=says):
+    with pytest.raises(CalibrationError, match=message):
         load_calibration(path)
 
 

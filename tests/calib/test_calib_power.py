@@ -32,13 +32,7 @@ from export.targets.file import for_model, list_targets, load_target, parse_targ
 TREES = Path(__file__).parents[1] / "data/sysfs"
 SECOND = 1_000_000_000
 IDLE_W = 5.0
-TRUE_J = {
-    "vision_encoder": 1.5,
-    "action_expert": 0.05,
-    "prefill": 4.0,
-    "decode": 0.2,
-    "semantic_context": 0.04,
-}
+TRUE_J = {"vision_encoder": 1.5, "action_expert": 0.05, "prefill": 4.0, "decode": 0.2, "semantic_context": 0.04}
 MIXTURES: dict[str, dict[str, float]] = {
     "idle": {},
     "vision_encoder": {"vision_encoder": 200},
@@ -176,7 +170,7 @@ def options(*arguments: str) -> argparse.Namespace:
     return parser.parse_args(list(arguments))
 
 
-def test_a_device_without_a_meter_is_refused_with_what_was_looked_for(
+def test_a_device_without_a_meter_is_refused_with_every_meter_that_was_tried(
     artifacts_dir: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(options("--artifacts", str(artifacts_dir)), TREES / "no_meter") == EXIT_REFUSED

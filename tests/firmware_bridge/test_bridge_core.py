@@ -51,7 +51,7 @@ class TestArming:
         bench.ask_to_arm()
         assert bench.calls() == [ids.RECOVERY_STAND]
 
-    def test_a_robot_somebody_else_drives_is_stopped_first(self) -> None:
+    def test_a_robot_that_another_client_drives_is_stopped_first(self) -> None:
         bench = Bench(mode=ids.MODE_LOCOMOTION)
         bench.ask_to_arm()
         assert set(bench.calls()) == {ids.STOP_MOVE}
@@ -168,13 +168,8 @@ class TestArmed:
         bench.wait(20)
         assert bench.moves()[-1].vx_mps == pytest.approx(-LIMITS.accel_mps2 / BRIDGE.rate_hz)
 
-    @given(
-        st.lists(
-            st.tuples(*[st.floats(allow_nan=True, allow_infinity=True)] * 3, st.integers(0, 120)),
-            max_size=30,
-        )
-    )
-    def test_whatever_is_commanded_stays_within_limits_and_slew(self, commands: list) -> None:
+    @given(st.lists(st.tuples(*[st.floats(allow_nan=True, allow_infinity=True)] * 3, st.integers(0, 120)), max_size=30))
+    def test_every_command_stays_within_limits_and_slew(self, commands: list) -> None:
         bench = Bench().arm()
         for vx, vy, wz, ms in commands:
             bench.command(vx, vy, wz)

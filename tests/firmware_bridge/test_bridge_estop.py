@@ -36,10 +36,10 @@ class TestOperator:
         bench.permit().arm()
 
     def test_a_stop_beside_an_arm_in_one_step_stops_and_holds(self) -> None:
-        for said in ((Stop(), Arm()), (Arm(), Stop()), (Stop(), Arm(), Arm())):
+        for message in ((Stop(), Arm()), (Arm(), Stop()), (Stop(), Arm(), Arm())):
             bench = Bench().arm()
             bench.drive(500)
-            bench.step(operator=said)
+            bench.step(operator=message)
             assert (bench.status.state, bench.status.blocked_by) == ("stopped", "estop")
             assert bench.moves()[-1] == ZERO
 
@@ -159,13 +159,13 @@ class TestPermission:
         _operator(bench)
         return bench
 
-    def test_it_is_refused_without_a_runner_that_asks_to_arm(self) -> None:
+    def test_it_is_refused_without_a_runner_that_requests_arming(self) -> None:
         bench = self.held()
         bench.step(operator=(Arm(),))
         assert bench.status.permit == "needed"
         assert "no runner asks to arm" in bench.status.reason
 
-    def test_it_is_refused_when_the_runner_has_not_asked_for_three_seconds(self) -> None:
+    def test_it_is_refused_three_seconds_after_the_runners_last_request(self) -> None:
         bench = self.held()
         bench.step(Arm())
         bench.wait(3100)
@@ -187,7 +187,7 @@ class TestPermission:
         bench.step()
         assert bench.status.permit == "needed"
 
-    def test_a_runner_that_asks_and_disconnects_in_one_step_does_not_wait_for_the_next_one(self) -> None:
+    def test_a_runner_that_requests_and_disconnects_in_one_step_does_not_wait_for_the_next_one(self) -> None:
         bench = self.held()
         bench.client = False
         bench.step(Arm())

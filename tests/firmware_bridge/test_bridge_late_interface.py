@@ -137,7 +137,7 @@ class TestProcess:
         wait_for(lambda: bridge.status().blocked_by == "state_silent", 5, "it listens to the robot's network")
         assert "waiting" not in bridge.status().reason.replace("waiting for a client", "")
 
-    def test_the_service_manager_sees_what_it_waits_for_and_that_it_is_alive(self, bridge: WaitingBridge) -> None:
+    def test_the_service_manager_receives_the_reason_for_waiting_and_keep_alives(self, bridge: WaitingBridge) -> None:
         wait_for(lambda: sum("WATCHDOG" in message for message in bridge.notifications()) >= 3, 10, "watchdog pings")
         lines = [message.get("STATUS", "") for message in bridge.notifications()]
         assert any(f"waiting for interface '{CABLE}'" in line for line in lines)
@@ -152,7 +152,7 @@ class TestProcess:
         time.sleep(0.2)
         assert bridge.status().blocked_by == "estop"
 
-    def test_it_ends_at_once_when_asked_to_while_it_waits(self, bridge: WaitingBridge) -> None:
+    def test_it_ends_at_once_on_a_signal_while_it_waits(self, bridge: WaitingBridge) -> None:
         bridge.process.terminate()
         assert bridge.process.wait(5) == 0
         assert not bridge.socket.exists()

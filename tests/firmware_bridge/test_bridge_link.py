@@ -40,7 +40,7 @@ messages = st.one_of(st.just(Arm()), st.just(Stop()), st.just(Release()), veloci
 
 
 @given(messages)
-def test_what_is_encoded_is_decoded(message: Message) -> None:
+def test_decoding_is_the_inverse_of_encoding(message: Message) -> None:
     assert decode(encode(message)) == message
 
 

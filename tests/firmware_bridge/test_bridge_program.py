@@ -87,7 +87,7 @@ def lines_of_code(source: str) -> int:
     return len(code - left_out)
 
 
-def test_without_a_bridge_the_client_says_what_to_do(tmp_path: Path) -> None:
+def test_without_a_bridge_the_client_advises_the_user(tmp_path: Path) -> None:
     with pytest.raises(BridgeUnavailable, match="start `edge-bridge"):
         BridgeClient(tmp_path / "bridge.sock")
 

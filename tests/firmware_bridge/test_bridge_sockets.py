@@ -125,7 +125,7 @@ class TestFolder:
         with pytest.raises(ConfigError, match=f"of user {owner}"):
             listen(folder / "bridge.sock")
 
-    def test_one_that_cannot_be_looked_into_is_one_line(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_an_unreadable_folder_is_one_line(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         def denied(_: Path) -> bool:
             raise PermissionError(errno.EACCES, "Permission denied")
 
@@ -196,7 +196,7 @@ class TestOperate:
             assert operate("stop", path)[0] == 0
         assert Stop() in bridge.received
 
-    def test_a_socket_where_nobody_listens_changes_nothing(self, path: Path, tmp_path: Path) -> None:
+    def test_a_socket_without_a_listener_changes_nothing(self, path: Path, tmp_path: Path) -> None:
         with answering(path):
             assert [operate(command, tmp_path / "none", path)[0] for command in ("status", "arm", "stop")] == [0] * 3
 
@@ -235,7 +235,9 @@ class TestCommandLine:
     def test_the_services_socket_is_the_units(self) -> None:
         assert SERVICE_SOCKET == units.SOCKET
 
-    def test_without_a_socket_both_places_are_asked(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_without_a_socket_both_default_sockets_are_tried(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         asked: list[tuple[str, ...]] = []
         monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
         monkeypatch.setattr(operate_module, "operate", lambda *given: asked.append(given) or (0, {}))

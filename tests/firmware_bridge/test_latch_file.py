@@ -48,7 +48,7 @@ def test_a_file_with_any_content_is_a_latch_with_a_printable_reason(path: Path, 
 
 
 @pytest.mark.parametrize("make", [Path.mkdir, os.mkfifo, lambda path: path.symlink_to(path)])
-def test_what_cannot_be_read_is_a_latch_and_is_left_alone(path: Path, make) -> None:
+def test_an_unreadable_file_is_a_latch_and_is_left_alone(path: Path, make) -> None:
     make(path)
     assert "reason unreadable" in read_latch(path)
     (line,) = kept(path, "")
@@ -59,12 +59,12 @@ def test_a_device_node_is_a_latch() -> None:
     assert "not a regular file" in read_latch(Path("/dev/null"))
 
 
-def test_a_folder_that_cannot_be_written_is_told_in_one_line(path: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_reported_in_one_line(path: Path) -> None:
     (line,) = kept(path / "missing folder" / "latch", "emergency stop by an operator")
     assert "cannot be written" in line and "may not survive a restart" in line and "\n" not in line
 
 
-def test_a_full_disk_is_told_in_one_line_and_the_latch_is_there_all_the_same(
+def test_a_full_disk_is_reported_in_one_line_and_the_latch_still_holds(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> int:
@@ -102,7 +102,7 @@ def test_it_counts_as_kept_once_a_kill_would_leave_it(path: Path, monkeypatch: p
     file.close(5)
 
 
-def test_a_disk_that_hangs_keeps_nobody_from_hearing_of_a_stop(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_hangs_does_not_delay_the_report_of_a_stop(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     hangs, real = threading.Event(), os.open
     file = LatchFile(path, lambda _: None)
     monkeypatch.setattr(os, "open", lambda *given: (hangs.wait(20), real(*given))[1])

@@ -29,7 +29,7 @@ def test_lines_come_out_in_order_with_their_prefix() -> None:
     assert stream.getvalue() == "edge-bridge: armed\nedge-bridge: stopped\n"
 
 
-def test_a_stalled_stream_holds_nobody_up_and_what_does_not_fit_is_counted() -> None:
+def test_a_stalled_stream_delays_no_caller_and_excess_lines_are_counted() -> None:
     stream = StalledStream()
     log = LineLog(stream, "edge-bridge", capacity=4)
     for number in range(100):

@@ -119,7 +119,7 @@ def test_with_the_opt_in_the_robots_own_range_is_accepted_and_no_more(
 
 
 @pytest.mark.parametrize("value", [2.9, 5.0])
-def test_a_speed_that_looks_like_kilometres_an_hour_is_asked_about(tmp_path: Path, value: float) -> None:
+def test_a_speed_that_resembles_kilometres_an_hour_is_refused_with_a_hint(tmp_path: Path, value: float) -> None:
     with pytest.raises(ConfigError, match=rf"if it is in km/h, write {value / 3.6:.2f}"):
         load_robot_config(robot_file(tmp_path, {"vx_max_mps": value}))
 

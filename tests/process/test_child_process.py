@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from collections import deque
@@ -71,7 +70,7 @@ def test_a_line_is_returned_once_it_is_whole() -> None:
         process.close(PATIENCE_S)
 
 
-def test_what_is_sent_reaches_the_childs_standard_input() -> None:
+def test_a_sent_line_reaches_the_childs_standard_input() -> None:
     process = child("import sys; print(sys.stdin.readline().upper(), end='')")
     try:
         assert process.send(b"hello")
@@ -91,7 +90,7 @@ def test_an_answer_that_does_not_come_is_a_timeout() -> None:
         process.close(1.0)
 
 
-def test_sending_to_a_dead_child_is_told_apart() -> None:
+def test_sending_to_a_dead_child_raises_its_own_error() -> None:
     process = child("")
     assert process.wait(PATIENCE_S) == 0
     assert not process.send(b"hello")
@@ -181,11 +180,6 @@ def test_a_worker_that_is_silent_for_too_long_is_killed(
     monkeypatch.setattr(worker_pool, "SILENT_S", 2.0)
     events = run_all(command, deque([job(tmp_path, "a", hangs=True)]))
     assert events[-1].failure.startswith("ended by SIGKILL")
-
-
-def test_without_a_number_of_jobs_there_is_one_per_core(command: list[str]) -> None:
-    with Workers(command, 0) as workers:
-        assert workers.free() == len(os.sched_getaffinity(0))
 
 
 def test_fewer_jobs_than_none_are_refused(command: list[str]) -> None:

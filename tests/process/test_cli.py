@@ -36,7 +36,7 @@ def test_every_command_has_help_with_examples_and_exit_codes(module: str) -> Non
     assert "exit codes:" in done.stdout
 
 
-def test_a_part_with_missing_packages_names_the_command_that_installs_them(
+def test_a_part_with_missing_packages_names_the_install_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "needs_much.py").write_text("import package_that_is_not_installed\n")

@@ -134,7 +134,7 @@ def test_killed_while_driving_the_robot_gets_zero_within_300_ms(robot: Robot) ->
 
 
 @pytest.mark.slow
-def test_after_an_emergency_stop_the_runner_waits_and_says_so_in_one_line_until_an_operator_arms_it(
+def test_after_an_emergency_stop_the_runner_waits_and_reports_it_in_one_line_until_an_operator_arms_it(
     robot: Robot,
 ) -> None:
     waiting = "waiting for `edge-bridge arm`"
@@ -224,7 +224,7 @@ def test_artifacts_that_do_not_verify_are_refused_by_name(tmp_path: Path, artifa
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (("--instruction", " "), "instruction is empty"),
         (("--duration", "-3"), "--duration"),
@@ -235,8 +235,8 @@ def test_artifacts_that_do_not_verify_are_refused_by_name(tmp_path: Path, artifa
         (("--record", "no-such-folder/flight.mcap"), "no-such-folder"),
     ],
 )
-def test_bad_input_gets_one_line_and_exit_code_2(tmp_path: Path, change: tuple[str, str], said: str) -> None:
+def test_bad_input_gets_one_line_and_exit_code_2(tmp_path: Path, change: tuple[str, str], message: str) -> None:
     done = run(*Robot(tmp_path, 1, tmp_path).arguments(*change))
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
-    assert said in done.stderr
+    assert message in done.stderr

@@ -59,7 +59,9 @@ class TestRenderProcess:
         camera.close()
 
     @pytest.mark.slow
-    def test_one_that_hangs_up_and_lives_on_is_not_waited_for(self, started: Callable[..., RenderProcess]) -> None:
+    def test_a_process_that_closes_its_output_and_lives_on_is_not_waited_for(
+        self, started: Callable[..., RenderProcess]
+    ) -> None:
         camera = started("", then="exec cat >/dev/null")
         with pytest.raises(CameraProcessError, match="still runs"):
             camera.wait_ready([])

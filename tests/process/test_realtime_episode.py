@@ -72,7 +72,7 @@ def test_an_episode_is_reached_by_ground_truth() -> None:
     assert (drive.end, drive.time_s) == ("reached", 1.0)
 
 
-def test_time_is_up_after_the_episodes_timeout() -> None:
+def test_the_episode_ends_at_its_timeout() -> None:
     end_ns = round(episode().timeout_s * S)
     drive = followed(TruePose(0, -50, 0, 0, ()), TruePose(end_ns - 1, -50, 0, 0, ()), TruePose(end_ns, -50, 0, 0, ()))
     assert drive.end == "timeout" and len(drive.poses) == 3

@@ -41,7 +41,7 @@ def test_every_stage_gets_a_line_when_it_begins_and_one_when_it_is_done(clock: l
     assert lines[3] == "edge-export: [2/3] graph: done, 1.0 s"
 
 
-def test_a_long_stage_says_now_and_then_what_it_is_at(clock: list[int]) -> None:
+def test_a_long_stage_reports_its_progress_now_and_then(clock: list[int]) -> None:
     out = io.StringIO()
     with BuildProgress("edge-export", STAGES, out) as progress, progress.stage("graph"):
         for step in range(60):
@@ -59,7 +59,7 @@ def test_nothing_is_written_to_standard_output(capsys: pytest.CaptureFixture[str
     assert "edge-export: a note" in captured.err
 
 
-def test_time_to_go_follows_the_speed_that_was_seen(clock: list[int]) -> None:
+def test_the_remaining_time_follows_the_measured_speed(clock: list[int]) -> None:
     with BuildProgress("x", STAGES, io.StringIO()) as progress:
         with progress.stage("weights"):
             after(clock, 20)  # twice what was expected
@@ -68,7 +68,7 @@ def test_time_to_go_follows_the_speed_that_was_seen(clock: list[int]) -> None:
             assert progress.remaining_s() == pytest.approx(45 + 40)
 
 
-def test_a_stage_from_the_cache_says_nothing_about_speed(clock: list[int]) -> None:
+def test_a_cached_stage_does_not_change_the_measured_speed(clock: list[int]) -> None:
     with BuildProgress("x", STAGES, io.StringIO()) as progress:
         with progress.stage("weights") as watch:
             watch.from_cache()
@@ -86,7 +86,7 @@ def test_the_remaining_time_begins_with_the_expected_one_and_is_never_negative(c
 
 
 @pytest.mark.parametrize(("seconds", "shown"), [(7.6, "8 s"), (125, "2 min 05 s"), (3720, "1 h 02 min")])
-def test_durations_are_words(seconds: float, shown: str) -> None:
+def test_durations_are_readable(seconds: float, shown: str) -> None:
     assert duration(seconds) == shown
 
 

@@ -64,8 +64,22 @@ def write_artifacts(model: TicVla, directory: Path, *, pair: bool = False, preci
 
 
 def edit_manifest(directory: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    """Change a manifest as somebody would who also seals it again."""
+    """Change a manifest and seal it again."""
     path = directory / MANIFEST_NAME
     manifest = json.loads(path.read_text())
     change(manifest)
     path.write_text(json.dumps(seal(manifest)))
+
+
+def replace_file(directory: Path, name: str, data: bytes) -> None:
+    """Replace a file and update its hash in the manifest."""
+    (directory / name).write_bytes(data)
+    entry = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    edit_manifest(directory, lambda m: m["files"].update({name: entry}))
+
+
+def flip_bit(directory: Path, name: str) -> None:
+    """Change one bit in the middle of a file."""
+    data = bytearray((directory / name).read_bytes())
+    data[len(data) // 2] ^= 1
+    (directory / name).write_bytes(data)

@@ -88,7 +88,7 @@ def test_every_fault_of_the_table_is_injected_or_says_why_not() -> None:
     assert not injected & set(NOT_INJECTED)
 
 
-def test_a_row_must_say_how_it_is_judged_and_name_a_known_fault() -> None:
+def test_a_row_must_have_a_criterion_and_name_a_known_fault() -> None:
     with pytest.raises(ValueError, match="a judge"):
         Row("test", None, lambda rig: 0)
     with pytest.raises(ValueError, match="not in the fault table"):

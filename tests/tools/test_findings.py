@@ -281,7 +281,7 @@ def test_a_dry_run_leaves_nothing(tmp_path: Path, suite: Path, capsys: Any) -> N
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         (("--rows", "nothing"), "--rows nothing"),
         (("--latency", "soon"), "--latency 'soon'"),
@@ -290,8 +290,8 @@ def test_a_dry_run_leaves_nothing(tmp_path: Path, suite: Path, capsys: Any) -> N
     ],
 )
 def test_bad_arguments_are_one_line(
-    arguments: tuple[str, ...], says: str, tmp_path: Path, suite: Path, capsys: Any
+    arguments: tuple[str, ...], message: str, tmp_path: Path, suite: Path, capsys: Any
 ) -> None:
     assert run(models(tmp_path / "models", "rl"), tmp_path / "out", suite, *arguments) == EXIT_BAD_INPUT
     found = capsys.readouterr().err
-    assert says in found and found.count("\n") == 1
+    assert message in found and found.count("\n") == 1

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from hypothesis import strategies as st
 from edge.flightlog.recorder import Recorder
 from firmware_bridge.output_file import partial_of
 from reporting import page
+from tests.support.html_page import HtmlPage, assert_loads_nothing
 from tests.support.runner import synthetic_run
 from tools.report import checks, demo_report, run_data
 from tools.report.demo_report import RunFiles, load_run, spread, write_report
@@ -60,44 +60,20 @@ def _failed(found: dict[str, checks.Check]) -> set[str]:
 # ---- the page
 
 
-class _Collector(HTMLParser):
-    def __init__(self) -> None:
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.text: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_data(self, data: str) -> None:
-        self.text.append(data)
-
-
-def _parse(html: str) -> _Collector:
-    parser = _Collector()
-    parser.feed(html)
-    return parser
-
-
 @pytest.mark.slow
 def test_the_page_loads_nothing_from_anywhere(html: str) -> None:
-    for tag, attributes in _parse(html).tags:
-        assert tag not in {"script", "link", "iframe", "object", "embed", "base"}
-        assert "href" not in attributes and "srcset" not in attributes
-        if "src" in attributes:
-            assert str(attributes["src"]).startswith("data:image/")
-    assert "url(" not in html and "@import" not in html
+    assert_loads_nothing(html)
 
 
 def test_the_models_text_cannot_act_on_the_page(html: str) -> None:
     assert "<script>alert" not in html
     assert "\u202e" not in html
-    shown = "".join(_parse(html).text)
+    shown = "".join(HtmlPage(html).pieces)
     assert 'turn </pre><script>alert("x")</script> ⟨U+202E⟩left⟨U+0007⟩ & <b>go</b> \U0001f916' in shown
 
 
 def test_every_picture_decodes(html: str) -> None:
-    pictures = [attributes["src"] for tag, attributes in _parse(html).tags if tag == "img"]
+    pictures = [attributes["src"] for tag, attributes in HtmlPage(html).tags if tag == "img"]
     assert len(pictures) == 4 + len(synthetic_run.generations(12.0))
     for uri in pictures:
         assert uri is not None
@@ -112,14 +88,14 @@ def test_contact_sheet_shows_the_frame_at_the_anchor(run_dir: Path, html: str) -
     assert "generation 1 · seen at 2.9 s · Δt 2.90 s at release" in html
 
 
-def test_untrained_weights_are_said_plainly(html: str) -> None:
+def test_untrained_weights_are_marked(html: str) -> None:
     assert "The weights are untrained" in html
 
 
 def _row_of(html: str, title: str) -> list[str]:
     """The cells of the first table row that holds this text."""
     row = next(row for row in html.split("<tr>") if title in row)
-    return ["".join(_parse(cell).text) for cell in row.split("</tr>")[0].split("</td>")[:-1]]
+    return ["".join(HtmlPage(cell).pieces) for cell in row.split("</tr>")[0].split("</td>")[:-1]]
 
 
 def test_commands_written_are_those_the_bridge_counted(html: str, summary: dict[str, Any]) -> None:
@@ -241,16 +217,14 @@ def test_bad_ticks_fail_their_check(tmp_path: Path, spoil: Callable[[list[dict[s
     assert check in _failed(_checks_of(tmp_path, ticks=ticks))
 
 
-def test_a_runner_that_gave_up_early_is_held_to_the_time_it_was_asked_for(tmp_path: Path) -> None:
+def test_a_runner_that_ended_early_is_judged_by_the_requested_time(tmp_path: Path) -> None:
     found = _checks_of(tmp_path, asked_s=60.0)
     assert found["control_ticks"].limit == 590 and not found["control_ticks"].passed
 
 
 @pytest.mark.parametrize(("beside_m", "reached"), [(1.4, True), (1.6, False)])
 @pytest.mark.parametrize("share", [0.5, 1.0], ids=["passed on the way", "at the end"])
-def test_trained_weights_are_asked_to_reach_the_goal(
-    tmp_path: Path, share: float, beside_m: float, reached: bool
-) -> None:
+def test_trained_weights_must_reach_the_goal(tmp_path: Path, share: float, beside_m: float, reached: bool) -> None:
     lines = synthetic_run.trace_lines(12.0)
     poses = [line for line in lines if line["kind"] == "pose"]
     where = poses[round(share * (len(poses) - 1))]
@@ -260,7 +234,9 @@ def test_trained_weights_are_asked_to_reach_the_goal(
 
 
 @pytest.mark.parametrize(("trained", "duration_s"), [(False, 60.0), (True, 59.0)])
-def test_the_goal_is_not_asked_of_those_that_cannot_reach_it(tmp_path: Path, trained: bool, duration_s: float) -> None:
+def test_the_goal_is_not_required_of_untrained_weights_or_short_runs(
+    tmp_path: Path, trained: bool, duration_s: float
+) -> None:
     assert "goal_nearest_m" not in _checks_of(tmp_path, asked_s=duration_s, trained=trained)
 
 
@@ -391,7 +367,7 @@ def _frames_that_are_no_pictures(data: Any) -> Callable[[Path], None]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("spoil", "said"),
+    ("spoil", "message"),
     [
         (_append_bytes("hil_trace.jsonl", b"\xff\xfe\n"), "hil_trace.jsonl cannot be read as UTF-8"),
         (_append_bytes("hil_trace.jsonl", b'{"kind": "pose", "t_ns": 1}\n'), "hil_trace.jsonl: a record lacks"),
@@ -406,14 +382,14 @@ def _frames_that_are_no_pictures(data: Any) -> Callable[[Path], None]:
     ],
 )
 def test_a_damaged_file_is_one_line_and_leaves_the_old_report(
-    tmp_path: Path, spoil: Callable[[Path], None], said: str, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, spoil: Callable[[Path], None], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     synthetic_run.write_run(tmp_path, 6.0)
     (tmp_path / "report.html").write_text("the old one")
     spoil(tmp_path)
     assert demo_report.main([str(tmp_path)]) == 2
     error = capsys.readouterr().err
-    assert said in error and error.count("\n") == 1
+    assert message in error and error.count("\n") == 1
     assert (tmp_path / "report.html").read_text() == "the old one"
 
 

@@ -237,7 +237,7 @@ START: tuple[Fault, ...] = (
         "upgrade-interrupted", 60, Action.STOP, 0, "start",
         "Writing the artifacts was interrupted: the old ones are still there.",
         "Export again.",
-        "tests/export/pipeline/test_export_directory.py::test_what_a_killed_export_was_replacing_comes_back",
+        "tests/export/pipeline/test_export_directory.py::test_the_directory_that_a_killed_export_replaced_is_restored",
     ),
 )  # fmt: skip
 

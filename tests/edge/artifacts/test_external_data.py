@@ -40,12 +40,6 @@ def test_no_place_where_a_tensor_can_sit_is_overlooked() -> None:
     assert {name: dict(fields) for name, fields in FIELDS.items()} == paths_to_tensors()
 
 
-def test_the_entries_are_where_onnx_has_them() -> None:
-    assert onnx.TensorProto.DESCRIPTOR.fields_by_name["external_data"].number == 13
-    fields = onnx.StringStringEntryProto.DESCRIPTOR.fields_by_name
-    assert (fields["key"].number, fields["value"].number) == (1, 2)
-
-
 def outside(location: str) -> onnx.TensorProto:
     tensor = onnx.TensorProto(name=location, data_type=1, dims=[2], data_location=onnx.TensorProto.EXTERNAL)
     for key, value in (("location", location), ("offset", "16"), ("length", "8")):

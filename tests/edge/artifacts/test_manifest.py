@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
@@ -27,7 +26,7 @@ from edge.inference.policy import Policy
 from edge.state.switches import Decoding, RecoverySwitch
 from export.cli import main
 from export.targets.file import load_target
-from tests.support.artifact_directory import edit_manifest
+from tests.support.artifact_directory import edit_manifest, flip_bit, replace_file
 
 
 @pytest.fixture
@@ -72,13 +71,6 @@ def test_no_flipped_bit_of_the_manifest_is_accepted(copy: Path, data: st.DataObj
         path.write_bytes(whole)
 
 
-def replace(directory: Path, name: str, data: bytes) -> None:
-    """Replace a file as somebody would who also fixes the hashes."""
-    (directory / name).write_bytes(data)
-    entry = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
-    edit_manifest(directory, lambda m: m["files"].update({name: entry}))
-
-
 def link_to_outside(directory: Path, name: str) -> None:
     outside = directory.parent / "outside"
     shutil.move(directory / name, outside)
@@ -88,12 +80,6 @@ def link_to_outside(directory: Path, name: str) -> None:
 def put_pipe(directory: Path, name: str) -> None:
     (directory / name).unlink()
     os.mkfifo(directory / name)
-
-
-def flip_bit(directory: Path, name: str) -> None:
-    data = bytearray((directory / name).read_bytes())
-    data[len(data) // 2] ^= 1
-    (directory / name).write_bytes(data)
 
 
 def cut(directory: Path, name: str) -> None:
@@ -108,7 +94,10 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "a symlink for the manifest": (lambda d: link_to_outside(d, "manifest.json"), r"manifest\.json: cannot be read"),
     "a pipe": (lambda d: put_pipe(d, "tokenizer.json"), "not a regular file"),
     "a pipe for the manifest": (lambda d: put_pipe(d, "manifest.json"), "not a regular file"),
-    "no graph": (lambda d: replace(d, "action_expert.onnx", b"not a graph"), r"action_expert\.onnx: not an ONNX model"),
+    "no graph": (
+        lambda d: replace_file(d, "action_expert.onnx", b"not a graph"),
+        r"action_expert\.onnx: not an ONNX model",
+    ),
     "no directory": (shutil.rmtree, "not a directory"),
     **{
         f"a manifest of {content[:9]!r}": (lambda d, text=content: (d / "manifest.json").write_text(text), "manifest")
@@ -118,9 +107,9 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
 for name in ("vision_encoder.onnx", "language_model.onnx", "tokenizer.json", "report.html"):
     DAMAGE[f"a flipped bit in {name}"] = (partial(flip_bit, name=name), rf"{name}: sha256")
 for name in ("model.pt", "weights.npy", "weights.pkl", "run.sh", "plugin.so", "model.onnx.py"):
-    DAMAGE[name] = (partial(replace, name=name, data=b"harmless"), rf"{name}.*of no kind that artifacts have")
+    DAMAGE[name] = (partial(replace_file, name=name, data=b"harmless"), rf"{name}.*of no kind that artifacts have")
 for head, kind in ((b"\x80\x04\x95", "a pickle"), (b"PK\x03\x04", "a zip archive"), (b"\x93NUMPY\x01", "a NumPy")):
-    DAMAGE[kind] = (partial(replace, name="report.json", data=head + b"..."), rf"report\.json: is {kind}")
+    DAMAGE[kind] = (partial(replace_file, name="report.json", data=head + b"..."), rf"report\.json: is {kind}")
 
 
 @pytest.mark.parametrize(("damage", "message"), DAMAGE.values(), ids=DAMAGE)
@@ -209,8 +198,8 @@ def test_a_manifest_has_defaults_of_the_switches(copy: Path, change: Edit, switc
     assert (runtime.decoding, runtime.recovery) == switches
 
 
-def test_a_graph_that_is_not_what_the_manifest_says_is_refused_when_opened(copy: Path) -> None:
-    replace(copy, "action_expert.onnx", (copy / "semantic_context.onnx").read_bytes())
+def test_a_graph_that_differs_from_the_manifest_is_refused_when_opened(copy: Path) -> None:
+    replace_file(copy, "action_expert.onnx", (copy / "semantic_context.onnx").read_bytes())
     with pytest.raises(ArtifactError, match="not those of the manifest"):
         Graph(load_artifacts(copy), "action_expert", threads=1)
 
@@ -219,7 +208,7 @@ def test_weights_outside_the_graph_cannot_be_reached(copy: Path, monkeypatch: py
     proto = onnx.load(str(copy / "semantic_context.onnx"))
     onnx.external_data_helper.convert_model_to_external_data(proto, location="planted.bin", size_threshold=0)
     onnx.save(proto, str(copy.parent / "external.onnx"))
-    replace(copy, "semantic_context.onnx", (copy.parent / "external.onnx").read_bytes())
+    replace_file(copy, "semantic_context.onnx", (copy.parent / "external.onnx").read_bytes())
     # The file is there, in the working directory, with weights of the right size.
     monkeypatch.chdir(copy.parent)
     assert Path("planted.bin").exists()
@@ -227,14 +216,14 @@ def test_weights_outside_the_graph_cannot_be_reached(copy: Path, monkeypatch: py
         load_artifacts(copy)
 
 
-def test_a_tokenizer_that_is_none_is_refused(copy: Path) -> None:
-    replace(copy, "tokenizer.json", b"{}")
+def test_an_invalid_tokenizer_is_refused(copy: Path) -> None:
+    replace_file(copy, "tokenizer.json", b"{}")
     with pytest.raises(ArtifactError, match="not a tokenizer"):
         LanguageModel(load_artifacts(copy))
 
 
 def test_a_graph_that_onnx_runtime_does_not_take_is_refused_when_opened(copy: Path) -> None:
-    replace(copy, "action_expert.onnx", onnx.ModelProto(ir_version=10).SerializeToString())
+    replace_file(copy, "action_expert.onnx", onnx.ModelProto(ir_version=10).SerializeToString())
     with pytest.raises(ArtifactError, match="cannot open"):
         Graph(load_artifacts(copy), "action_expert", threads=1)
 
@@ -321,7 +310,7 @@ def add_external(directory: Path, key: str, value: str, *, again: bool = False) 
     entries = [entry for entry in tensor.external_data if entry.key == key and not again]
     entry = entries[0] if entries else tensor.external_data.add()
     entry.key, entry.value = key, value
-    replace(directory, "vision_encoder.onnx", model.SerializeToString())
+    replace_file(directory, "vision_encoder.onnx", model.SerializeToString())
 
 
 @pytest.mark.parametrize(

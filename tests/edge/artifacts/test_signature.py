@@ -53,7 +53,7 @@ def change(directory: Path, **values: Any) -> None:
     path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
 
 
-def test_signed_artifacts_are_accepted_and_say_their_release(signed: Path, trust: Trust) -> None:
+def test_signed_artifacts_are_accepted_and_name_their_release(signed: Path, trust: Trust) -> None:
     assert load_artifacts(signed, trust).release == 7
 
 
@@ -217,7 +217,7 @@ def test_the_command_makes_a_key_signs_and_verifies(
     assert {path.name for path in tmp_path.iterdir()} == {"nano", "release.pem", "release.pem.pub"}
 
 
-def test_without_the_package_it_says_what_to_install(
+def test_a_missing_package_is_named_with_its_install_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "cryptography.exceptions", None)

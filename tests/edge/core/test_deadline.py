@@ -11,7 +11,7 @@ from edge.core.deadline import Deadline
 S = 1_000_000_000
 
 
-def test_what_is_left_shrinks_and_never_goes_below_zero() -> None:
+def test_the_remaining_time_shrinks_and_never_goes_below_zero() -> None:
     now_ns = [0]
     deadline = Deadline(7.0, clock=lambda: now_ns[0])
     now_ns[0] = 5 * S
@@ -20,13 +20,13 @@ def test_what_is_left_shrinks_and_never_goes_below_zero() -> None:
     assert (deadline.left_s(), deadline.left_s(1.0)) == (0.0, 0.0)
 
 
-def test_what_hangs_is_left_behind() -> None:
+def test_a_hanging_call_is_left_behind() -> None:
     go_on = threading.Event()
     assert not Deadline(0.05).run("hangs", lambda: go_on.wait(30))
     go_on.set()
 
 
-def test_what_ends_in_time_is_waited_for_and_its_error_raised() -> None:
+def test_a_call_that_ends_in_time_is_awaited_and_its_error_raised() -> None:
     done: list[int] = []
     assert Deadline(30.0).run("ends", lambda: done.append(1)) and done == [1]
     with pytest.raises(ZeroDivisionError):

@@ -7,14 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from edge.core.device import (
-    OPENVINO,
-    TENSORRT,
-    DeviceError,
-    check_power_mode,
-    l4t_release,
-    read_device,
-)
+from edge.core.device import OPENVINO, TENSORRT, DeviceError, check_power_mode, l4t_release, read_device
 
 CONF = """
 < POWER_MODEL ID=0 NAME=MAXN_SUPER >
@@ -64,7 +57,7 @@ def test_a_device_is_identified(
 
 
 @pytest.mark.parametrize("text", ["", "R36", "# R35"])
-def test_what_is_not_a_release_is_none(text: str) -> None:
+def test_text_without_a_release_gives_none(text: str) -> None:
     assert l4t_release(text) is None
 
 

@@ -48,7 +48,7 @@ def test_memory_does_not_grow_with_the_samples() -> None:
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_what_is_not_finite_is_not_counted(value: float) -> None:
+def test_values_that_are_not_finite_are_not_counted(value: float) -> None:
     samples = Samples()
     samples.add(value)
     assert len(samples) == 0

@@ -38,21 +38,18 @@ def event(name: str, provider: str, operator: str, size: int = 4096, duration_us
     return {"cat": "Node", "name": f"{name}_kernel_time", "dur": duration_us, "args": args}
 
 
-def test_a_profile_tells_where_every_node_ran() -> None:
+def test_a_profile_names_the_provider_of_every_node() -> None:
     events = [
         {"cat": "Session", "name": "session_initialization"},
         event("a", CUDA, "MatMul", duration_us=5),
         event("a", CUDA, "MatMul", duration_us=7),
         event("b", CPU_PROVIDER, "Shape", size=16),
     ]
-    assert placements(events) == [
-        Placement(CPU_PROVIDER, "Shape", 1, 16, 10),
-        Placement(CUDA, "MatMul", 1, 4096, 12),
-    ]
+    assert placements(events) == [Placement(CPU_PROVIDER, "Shape", 1, 16, 10), Placement(CUDA, "MatMul", 1, 4096, 12)]
 
 
 @pytest.mark.parametrize("events", [[], [{"cat": "Node", "name": "a_kernel_time", "args": {}}], ["text"]])
-def test_a_profile_that_does_not_tell_is_refused(events: Sequence[Any]) -> None:
+def test_an_incomplete_profile_is_refused(events: Sequence[Any]) -> None:
     with pytest.raises(ValueError, match="node"):
         placements(events)
 
@@ -81,7 +78,7 @@ def test_only_nodes_that_compute_shapes_may_run_on_the_processor(
     assert check.level is level and found in check.found
 
 
-def test_every_graph_of_real_artifacts_runs_where_its_manifest_says(artifacts: Artifacts) -> None:
+def test_every_graph_of_real_artifacts_runs_on_its_manifests_provider(artifacts: Artifacts) -> None:
     checks = [profile_graph(artifacts, name) for name in artifacts.graphs]
     assert [check.level for check in checks] == [Level.OK] * len(artifacts.graphs), checks
 
@@ -127,7 +124,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> RobotConfig:
         ("disarmed", "operator", Level.OK, "waits for `edge-bridge arm`"),
     ],
 )
-def test_a_bridge_that_would_refuse_to_arm_fails_and_tells_why(
+def test_a_bridge_that_would_refuse_to_arm_fails_with_its_reason(
     robot: RobotConfig, state: str, blocked_by: str, level: Level, text: str
 ) -> None:
     status = BridgeStatus(1, state, "why", 0, 0, 0, (0.0, 0.0, 0.0), True, "none", blocked_by)
@@ -227,7 +224,7 @@ def test_real_artifacts_on_the_machine_that_they_are_for(artifacts_dir: Path, tm
     assert sum(result["counts"].values()) == len(result["checks"])
 
 
-def test_what_is_not_given_is_shown_as_skipped(tmp_path: Path) -> None:
+def test_a_missing_option_is_shown_as_skipped(tmp_path: Path) -> None:
     _, result = run(tmp_path, "--logs", str(tmp_path))
     checks = by_name(result)
     for name in ("artifacts", "target", "tick", "robot file"):
@@ -240,7 +237,7 @@ def test_artifacts_of_another_target_fail(artifacts_dir: Path, tmp_path: Path) -
     assert (code, by_name(result)["artifacts"]["level"]) == (EXIT_CHECK_FAILED, "fail")
 
 
-def test_what_cannot_be_opened_fails_and_the_rest_is_still_checked(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_opened_fails_and_the_rest_is_still_checked(tmp_path: Path) -> None:
     code, result = run(tmp_path, "--artifacts", str(tmp_path / "none"), "--robot", str(tmp_path / "none.toml"))
     checks = by_name(result)
     assert code == EXIT_CHECK_FAILED
@@ -264,7 +261,7 @@ def test_a_manifest_that_is_wrong_about_its_device_is_a_failure_among_others(
     assert "clock" in checks
 
 
-def test_the_memory_of_a_graphics_card_is_known_from_that_of_a_machine() -> None:
+def test_a_graphics_cards_memory_is_told_apart_from_the_machines() -> None:
     for name, own in (("cpu", False), ("orin", False), ("rtx4060", True)):
         facts = target_facts({"provenance": {"target": load_target(name).to_dict()}})
         assert facts is not None

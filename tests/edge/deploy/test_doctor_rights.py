@@ -88,13 +88,13 @@ def test_another_users_right_to_a_file_is_that_of_its_class(tmp_path: Path) -> N
     assert not stranger.may(tmp_path / "none")
 
 
-def test_what_cannot_be_tried_for_another_user_is_skipped_and_names_the_user() -> None:
+def test_a_check_that_needs_another_users_rights_is_skipped_and_names_the_user() -> None:
     service = replace(ME, name="service", other=True)
     for check in (real_time(50, service, lambda _priority: []), locked_memory(65536, service)):
         assert (check.level, "service" in check.found) == (Level.SKIP, True)
 
 
-def test_a_user_that_this_machine_does_not_know_is_bad_input() -> None:
+def test_an_unknown_user_is_bad_input() -> None:
     with pytest.raises(ConfigError, match="--user no-such-user"):
         user_named("no-such-user")
     assert user_named(None).uid == os.geteuid()
@@ -156,7 +156,7 @@ class TestServiceSockets:
             assert socket_folder(path, same).level is Level.FAIL
 
     @pytest.mark.parametrize("mode", [0o666, 0o662, 0o661])
-    def test_a_socket_that_everybody_reaches_fails(self, path: Path, mode: int) -> None:
+    def test_a_world_reachable_socket_fails(self, path: Path, mode: int) -> None:
         for file in (path, Path(f"{path}{OPERATOR_SUFFIX}")):
             file.chmod(mode)
             assert socket_folder(path, self.runner(path, self.RUNNERS)).level is Level.FAIL
@@ -186,7 +186,7 @@ def meter(kind: str, open_it, sysfs_root: Path = Path("/nowhere"), user: UserRig
     return power_meter(kind, open_it, sysfs_root, user, clock=lambda: 1, sleep=lambda _seconds: None)
 
 
-def test_a_meter_says_what_it_reads_and_what_that_leaves_out() -> None:
+def test_a_meter_names_its_rails_and_the_missing_consumers() -> None:
     check = meter("ina3221", FakeMeter)
     assert (check.level, check.found) == (Level.OK, "12.5 W, ina3221 VDD_IN, measured (not at the wall)")
 
@@ -236,7 +236,7 @@ def test_an_energy_counter_that_only_root_may_read_is_a_warning_for_the_services
     assert meter("rapl", lambda: rapl, tmp_path, service).level is Level.OK
 
 
-def test_a_node_that_not_everybody_may_open_brings_its_group(tmp_path: Path) -> None:
+def test_a_restricted_node_adds_its_group(tmp_path: Path) -> None:
     (tmp_path / "dev").mkdir()
     (tmp_path / "dev" / "nvmap").touch()
     (tmp_path / "dev" / "nvmap").chmod(0o660)

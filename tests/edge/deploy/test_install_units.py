@@ -72,7 +72,7 @@ def units(artifacts_dir: Path, tmp_path: Path, host: Host) -> Units:
     return run
 
 
-def test_it_writes_both_units_and_the_user_and_says_how_to_start_them(units: Units, tmp_path: Path) -> None:
+def test_it_writes_both_units_and_the_user_and_prints_the_start_command(units: Units, tmp_path: Path) -> None:
     code, result = units()
     assert code == EXIT_DONE
     expected = {BRIDGE_UNIT, RUNNER_UNIT, FIREWALL_UNIT, FIREWALL_FILE, SYSUSERS_FILE}
@@ -126,9 +126,7 @@ def test_a_robot_that_would_drive_as_soon_as_its_service_starts_is_refused_in_on
     assert not (tmp_path / "units").exists()
 
 
-def test_with_consent_it_is_written_and_says_so_but_is_not_started_with_the_machine(
-    units: Units, tmp_path: Path
-) -> None:
+def test_with_consent_it_is_written_and_not_enabled_at_boot(units: Units, tmp_path: Path) -> None:
     code, result = units("--arm-at-start", robot=SHIPPED)
     assert (code, result and result["commands"][-1]) == (EXIT_DONE, f"sudo systemctl start {RUNNER_UNIT}")
     assert result is not None
@@ -136,7 +134,7 @@ def test_with_consent_it_is_written_and_says_so_but_is_not_started_with_the_mach
     assert "# --arm-at-start was given: " in (tmp_path / "units" / RUNNER_UNIT).read_text()
 
 
-def test_consent_that_the_robot_file_makes_useless_is_said(units: Units, capsys: pytest.CaptureFixture[str]) -> None:
+def test_useless_consent_is_reported(units: Units, capsys: pytest.CaptureFixture[str]) -> None:
     assert units("--arm-at-start")[0] == EXIT_DONE
     assert "--arm-at-start changes nothing" in capsys.readouterr().err
 
@@ -149,7 +147,7 @@ def test_names_of_users_and_group_can_be_given(units: Units, tmp_path: Path) -> 
     assert units("--bridge-user", "r", "--runner-user", "r")[0] == EXIT_BAD_INPUT
 
 
-def test_without_nft_the_rules_are_written_and_the_lack_is_said(
+def test_without_nft_the_rules_are_written_and_the_missing_package_is_named(
     units: Units, host: Host, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert units(on=replace(host, nft=lambda: None))[0] == EXIT_DONE
@@ -158,7 +156,7 @@ def test_without_nft_the_rules_are_written_and_the_lack_is_said(
     assert "apt install nftables" in capsys.readouterr().err
 
 
-def test_a_firewall_that_lets_a_whole_network_through_is_said_to(
+def test_a_firewall_that_accepts_a_whole_network_is_reported(
     units: Units, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     units()
@@ -186,7 +184,7 @@ def test_for_the_system_they_go_where_systemd_reads_them(units: Units, host: Hos
     assert (host.root / "etc/tic-vla-edge" / FIREWALL_FILE).is_file()
 
 
-def test_the_runners_memory_is_what_the_target_leaves_it(units: Units, tmp_path: Path) -> None:
+def test_the_runners_memory_is_the_targets_budget(units: Units, tmp_path: Path) -> None:
     units()
     device = load_target("cpu", "nano").device
     available = round((device.memory_gib - device.reserved_gib) * (1 << 30))
@@ -229,7 +227,7 @@ def test_a_file_that_differs_is_replaced_only_by_force(
     [replace(GOOD, complaints=("unknown key",)), replace(GOOD, exposure={BRIDGE_UNIT: 3.1})],
     ids=["complaint", "exposed"],
 )
-def test_what_systemd_finds_fault_with_is_a_failed_check(units: Units, host: Host, verdict: UnitVerdict) -> None:
+def test_a_complaint_of_systemd_is_a_failed_check(units: Units, host: Host, verdict: UnitVerdict) -> None:
     code, result = units(on=replace(host, check=lambda _paths: verdict))
     assert code == EXIT_CHECK_FAILED
     assert result is not None
@@ -296,7 +294,7 @@ def test_the_jetsons_runner_gets_its_nodes_and_its_engines(
     assert f'"--engines" "{tmp_path}/orin.engines"' in text
 
 
-def test_a_runner_without_its_device_is_written_to_be_looked_at_but_not_installed(
+def test_a_runner_without_its_device_is_written_but_not_installed(
     units: Units, orin_dir: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert units(artifacts=orin_dir)[0] == EXIT_DONE
@@ -310,7 +308,7 @@ def make_nodes(root: Path, names: Sequence[str]) -> None:
         (root / "dev" / name).touch()
 
 
-def test_what_the_services_user_could_not_read_is_named(tmp_path: Path) -> None:
+def test_files_that_the_services_user_cannot_read_are_named(tmp_path: Path) -> None:
     folder = tmp_path / "artifacts"
     folder.mkdir(mode=0o755)
     for name, mode in (("graph.onnx", 0o600), ("manifest.json", 0o644)):
@@ -386,7 +384,7 @@ def test_artifacts_whose_runner_would_run_before_the_bridge_are_refused(
         (DdsConfig(0, "eth0"), ("10.0.0.1/8",)),
     ],
 )
-def test_a_network_that_is_not_known_is_asked_for(dds: DdsConfig, given: tuple[str, ...]) -> None:
+def test_an_unknown_network_is_refused_with_the_option_that_sets_it(dds: DdsConfig, given: tuple[str, ...]) -> None:
     with pytest.raises(UnitError, match="--network"):
         networks(dds, *given)
     with pytest.raises(UnitError, match=r"eth0.*10\.0\.0\.0/8.*--network"):

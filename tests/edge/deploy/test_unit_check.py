@@ -43,7 +43,7 @@ def programs(folder: Path) -> Path:
 
 @needs_systemd
 @pytest.mark.parametrize("folder", ["bin", "two words", "100%n", "$HOME", "a;b", "ü"])
-def test_systemd_finds_the_programs_whatever_their_folder_is_called(tmp_path: Path, folder: str) -> None:
+def test_systemd_finds_the_programs_in_a_folder_of_any_name(tmp_path: Path, folder: str) -> None:
     found = programs(tmp_path / folder)
     paths = written(tmp_path, inputs(programs=found, python=found / "edge-run"))
     assert check_units(paths).complaints == ()
@@ -92,7 +92,7 @@ def test_systemds_version_is_read(answer: tuple[int, str], version: int | None) 
     assert systemd_version(which=lambda _name: None) is None
 
 
-def test_without_systemd_the_verdict_says_that_nothing_was_checked(tmp_path: Path) -> None:
+def test_without_systemd_the_verdict_reports_that_nothing_was_checked(tmp_path: Path) -> None:
     verdict = check_units([tmp_path / BRIDGE_UNIT], which=lambda _name: None)
     assert verdict.good
     assert "systemd-analyze is not on this machine" in verdict.not_checked[0]
@@ -126,7 +126,7 @@ def test_every_line_of_verify_is_a_complaint_unless_it_is_about_another_unit(
     assert (verdict.good, len(verdict.others)) == (good, others)
 
 
-def test_an_old_systemd_that_cannot_score_files_is_said_to_be_one() -> None:
+def test_an_old_systemd_that_cannot_score_files_is_reported() -> None:
     verdict = checked((0, ""), (1, "systemd-analyze: unrecognized option '--offline=true'\n"))
     assert verdict.good
     assert "systemd 250" in verdict.not_checked[0]

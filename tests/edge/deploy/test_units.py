@@ -127,11 +127,7 @@ AT_HOME = (Path("/home/me/odometry.json"),)
         (runner_unit, {}, {"PrivateDevices": ["yes"], "MemoryDenyWriteExecute": ["yes"]}),
         (runner_unit, {"memory_bytes": None}, {"MemoryMax": ["75%"]}),
         (bridge_unit, {"bridge_cores": (6, 7)}, {"CPUAffinity": ["6 7"]}),
-        (
-            bridge_unit,
-            {"systemd": 254},
-            {"RestartSec": ["100ms"], "RestartSteps": ["5"], "RestartMaxDelaySec": ["5s"]},
-        ),
+        (bridge_unit, {"systemd": 254}, {"RestartSec": ["100ms"], "RestartSteps": ["5"], "RestartMaxDelaySec": ["5s"]}),
         (bridge_unit, {"robot_files": AT_HOME}, {"BindReadOnlyPaths": ['"/home/me/odometry.json"']}),
         (runner_unit, {"robot_files": AT_HOME}, {"BindReadOnlyPaths": ['"/home/me/odometry.json"']}),
         (
@@ -165,7 +161,7 @@ def test_a_unit_has_these_settings(
         (runner_unit, {}, "tic-vla-operators"),
     ],
 )
-def test_a_unit_has_nothing_of_this(
+def test_a_unit_lacks_these_settings(
     unit: Callable[[ServiceInputs], str], changes: dict[str, object], absent: str
 ) -> None:
     assert absent not in unit(inputs(**changes))
@@ -283,7 +279,7 @@ def test_without_a_firewall_no_unit_waits_for_it(changes: dict[str, object]) -> 
     assert FIREWALL_UNIT not in bridge_unit(inputs(**changes)) + runner_unit(inputs(**changes))
 
 
-def test_what_lies_in_a_home_folder_is_shown_and_nothing_else() -> None:
+def test_only_the_needed_files_of_a_home_folder_are_visible() -> None:
     at_home = inputs(prefixes=(Path("/home/me/tic vla/.venv"),), artifacts=Path("/home/me/100%"))
     found = settings(runner_unit(at_home))
     assert found["ProtectHome"] == ["tmpfs"]

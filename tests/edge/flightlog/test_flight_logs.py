@@ -32,7 +32,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_what_fits_stays_and_else_the_oldest_runs_are_deleted_as_a_whole(folder: Path) -> None:
+def test_the_oldest_runs_are_deleted_as_a_whole_when_the_limit_is_exceeded(folder: Path) -> None:
     assert clean(folder, 500) == ([], 500)
     assert len(names(folder)) == 10
     deleted, left = clean(folder, 350)
@@ -48,7 +48,7 @@ def test_a_run_is_as_old_as_its_newest_part(folder: Path) -> None:
     assert "flight-3.mcap" not in names(folder)
 
 
-def test_the_newest_runs_stay_whatever_they_take(folder: Path) -> None:
+def test_the_newest_runs_stay_at_any_size(folder: Path) -> None:
     _, left = clean(folder, 0)
     assert left == 100 * KEEP_RUNS
     assert names(folder) == {f"flight-{n}{p}.mcap" for n in (3, 4) for p in ("", ".002")}

@@ -211,7 +211,7 @@ def change_command(log: Log) -> None:
     ],
     ids=["plan", "tick of the plan", "plan that is not finite", "command", "text", "instruction"],
 )
-def test_what_differs_is_beyond_the_tolerance(
+def test_a_difference_beyond_the_tolerance_is_reported(
     log: Log, change: Callable[[Log], object], where: tuple[str, str], found: float
 ) -> None:
     change(log)
@@ -221,7 +221,7 @@ def test_what_differs_is_beyond_the_tolerance(
 
 
 @pytest.mark.slow
-def test_what_differs_within_the_tolerance_and_a_heading_a_whole_turn_away_are_the_same(log: Log) -> None:
+def test_differences_within_the_tolerance_and_whole_turns_are_equal(log: Log) -> None:
     change_plan(log)
     log.payload("/tick", 21)["trajectory"][1][2] += 2 * math.pi
     assert log.replay("--tolerance-cm", "1.01")[0] == 0
@@ -265,7 +265,7 @@ def test_a_generation_is_decoded_under_its_recorded_constraint(log: Log, monkeyp
 
 
 @pytest.mark.slow
-def test_what_the_log_lost_is_skipped_and_counted(log: Log) -> None:
+def test_records_missing_in_the_log_are_skipped_and_counted(log: Log) -> None:
     lost_ns = log.payload("/tick", 20)["frame_ns"]
     log.drop(lambda topic, stamp_ns, _: topic == "/camera" and stamp_ns == lost_ns)
     code, result = log.replay()
@@ -307,7 +307,7 @@ def test_records_of_two_threads_may_lie_in_the_file_the_other_way_round(log: Log
 
 
 @pytest.mark.slow
-def test_without_the_frames_poses_past_motion_comes_from_the_ticks(log: Log) -> None:
+def test_without_the_poses_of_frames_past_motion_comes_from_the_ticks(log: Log) -> None:
     for index in range(4):
         del log.payload("/semantic", index)["frame_poses"]
         del log.payload("/semantic", index)["way"]

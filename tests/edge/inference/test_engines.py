@@ -15,10 +15,7 @@ import pytest
 
 from edge.artifacts.manifest import Artifacts, load_artifacts
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_REFUSED
-from edge.core.device import (
-    TENSORRT,
-    DeviceFacts,
-)
+from edge.core.device import TENSORRT, DeviceFacts
 from edge.deploy.install import main
 from edge.inference.engines import (
     ENGINES_NAME,
@@ -147,12 +144,12 @@ def test_an_engine_swapped_by_renames_while_it_was_opened_is_refused_although_th
         verified.check_unchanged()
 
 
-def test_nothing_is_asked_of_artifacts_without_engines(artifacts: Artifacts, engines: Path) -> None:
+def test_artifacts_without_engines_need_no_build(artifacts: Artifacts, engines: Path) -> None:
     check(artifacts, engines).check_unchanged()
     assert build(artifacts, engines, silent) == {}
 
 
-def test_what_was_built_is_accepted_and_may_be_opened(orin: Artifacts, engines: Path) -> None:
+def test_built_engines_are_accepted_and_can_be_opened(orin: Artifacts, engines: Path) -> None:
     fake = FakeTensorRt()
     results = build(orin, engines, silent, fake.machine())
     check(orin, engines, fake.machine()).check_unchanged()
@@ -160,7 +157,7 @@ def test_what_was_built_is_accepted_and_may_be_opened(orin: Artifacts, engines: 
     assert all(result["built"] for result in results.values())
 
 
-def test_the_runner_finds_what_was_built_and_compiles_nothing(
+def test_the_runner_finds_the_built_engines_and_compiles_nothing(
     built: FakeTensorRt, orin: Artifacts, engines: Path
 ) -> None:
     ready, compiled = with_engines(orin, engines), list(built.compiled)
@@ -225,7 +222,7 @@ OTHER_DEVICES = [
 
 
 @pytest.mark.parametrize(("change", "difference"), OTHER_DEVICES)
-def test_an_engine_of_another_device_or_release_is_refused_by_what_differs(
+def test_an_engine_of_another_device_or_release_is_refused_with_the_difference(
     built: FakeTensorRt, orin: Artifacts, engines: Path, change: dict[str, str], difference: str
 ) -> None:
     built.facts = replace(FACTS, **change)
@@ -246,7 +243,7 @@ def test_other_options_and_another_model_need_another_engine(
         check(load_artifacts(directory), engines, built.machine())
 
 
-def test_the_key_says_nothing_of_power(orin: Artifacts, engines: Path) -> None:
+def test_the_key_does_not_depend_on_power(orin: Artifacts, engines: Path) -> None:
     build(orin, engines, silent, FakeTensorRt().machine())
     inputs = json.loads((engines / ENGINES_NAME).read_text())["graphs"]["vision_encoder"]["inputs"]
     facts = {"architecture", "device", "l4t", "onnxruntime", "provider_version"}

@@ -130,7 +130,7 @@ def test_a_part_that_does_not_fit_is_refused_before_it_is_fed(artifacts: Artifac
     assert run.finish(segments, max_new_tokens=2).prompt_tokens == sum(len(s.ids) for s in segments)
 
 
-def test_every_call_is_announced_with_what_it_took_the_last_time(artifacts: Artifacts) -> None:
+def test_every_call_is_announced_with_its_last_duration(artifacts: Artifacts) -> None:
     language = model(artifacts, 64)
     segments = language.prompt.build(frames(1, 64, 256), "stop")
     announced: list[list[int]] = []
@@ -155,9 +155,7 @@ def test_an_interrupt_from_another_thread_ends_a_call_that_is_under_way(artifact
         language.begin(cancelled, interrupt=interrupt).finish(segments, max_new_tokens=5)
 
 
-def test_what_an_earlier_or_interrupted_generation_left_in_the_buffers_is_not_read(
-    artifacts: Artifacts, expected: tuple
-) -> None:
+def test_leftovers_of_an_earlier_or_interrupted_generation_are_not_read(artifacts: Artifacts, expected: tuple) -> None:
     language = model(artifacts, 64)
     interrupt = Interrupt()
     other = language.prompt.build(frames(4, 64, 256, seed=9), SENTENCE * 3)

@@ -35,7 +35,7 @@ def semantic(policy: Policy, artifacts: Artifacts, seed: int, tokens: int = 40) 
     return SemanticState(seed, 0, HERE, 0, kv, policy.semantic_context(kv), "", None)
 
 
-def test_tokens_are_written_where_they_are_asked_for(policy: Policy) -> None:
+def test_tokens_are_written_into_the_given_buffer(policy: Policy) -> None:
     own = policy.encode(picture(1))
     buffer = np.zeros(policy.tokens_shape, dtype=np.float32)
     assert policy.encode(picture(1), out=buffer) is buffer
@@ -114,7 +114,7 @@ def test_a_semantic_context_can_be_interrupted(policy: Policy, artifacts: Artifa
         policy.semantic_context(np.zeros((1, 8, artifacts.runtime.kv_dim), dtype=np.float32), interrupt)
 
 
-def test_others_see_when_a_tick_computes(artifacts: Artifacts) -> None:
+def test_a_computing_tick_is_visible_to_other_threads(artifacts: Artifacts) -> None:
     seen: list[str] = []
 
     class Spy(TickActivity):
@@ -131,7 +131,7 @@ def test_others_see_when_a_tick_computes(artifacts: Artifacts) -> None:
     assert seen == ["begin", "end"]
 
 
-def test_a_graphs_own_workers_run_where_the_role_says(artifacts: Artifacts) -> None:
+def test_a_graphs_own_workers_run_on_the_roles_cores(artifacts: Artifacts) -> None:
     """`/proc` knows where a thread may run."""
     core = max(os.sched_getaffinity(0))
     tasks = Path("/proc/self/task")

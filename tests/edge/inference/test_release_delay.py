@@ -37,7 +37,7 @@ def test_the_same_seed_gives_the_same_delays(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("bad", ["-1", "nan", "inf", "1e9", "no-such-file.json"])
-def test_what_is_no_delay_is_refused(bad: str) -> None:
+def test_an_invalid_delay_is_refused(bad: str) -> None:
     with pytest.raises(ReleaseDelayError):
         parse_release_delay(bad)
 

@@ -83,13 +83,7 @@ def test_no_plan_can_leave_the_limits(points: list[tuple[float, float, float]], 
 
 
 @settings(max_examples=1000)
-@given(
-    st.floats(0.0, 1e6),
-    st.floats(-1e6, 1e6),
-    st.floats(0.01, 3.8),
-    st.floats(0.01, 4.0),
-    st.floats(1e-6, 1.0),
-)
+@given(st.floats(0.0, 1e6), st.floats(-1e6, 1e6), st.floats(0.01, 3.8), st.floats(0.01, 4.0), st.floats(1e-6, 1.0))
 @example(speed=3.2254540894089683, yaw_rate=0.0, vx_max_mps=0.8, wz_max_radps=1.0, speed_scale=1.0)
 def test_no_velocity_leaves_a_limit_by_a_single_bit(
     speed: float, yaw_rate: float, vx_max_mps: float, wz_max_radps: float, speed_scale: float
@@ -160,7 +154,7 @@ def test_no_speed_scale_raises_a_limit_and_one_that_is_no_share_gives_no_speed(s
     assert driven(scale, plan(0.5))[0] == pytest.approx(LIMITS.vx_max_mps if scale > 1 else 0.0)
 
 
-def test_a_reason_to_hold_is_zero_whatever_the_plan_and_speeding_up_begins_anew() -> None:
+def test_a_reason_to_hold_gives_zero_for_any_plan_and_restarts_the_slew_limit() -> None:
     controller = Controller(CONFIG)
     for tick in range(20):
         controller.step(fresh(plan(0.08)), tick * TICK_NS)

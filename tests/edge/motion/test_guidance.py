@@ -36,7 +36,7 @@ def test_a_waypoint_is_the_same_place_seen_from_anywhere(anchor: SE2, now: SE2, 
     assert world(now, tuple(seen[0, 0].astype(float))) == pytest.approx(world(anchor, point), abs=1e-3)
 
 
-def test_a_robot_that_has_not_moved_sees_them_as_they_were_written() -> None:
+def test_a_robot_that_has_not_moved_sees_them_unchanged() -> None:
     written = ((1.0, 0.0), (2.0, 0.5), (3.0, -1.25))
     assert np.array_equal(waypoints_now(written, SE2(0.0, 0.0, 0.0)), np.array([written], dtype=np.float32))
 

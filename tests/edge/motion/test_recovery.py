@@ -127,7 +127,7 @@ def only_back(pose: SE2, command: VelocityCommand) -> SE2:
 
 
 @pytest.mark.parametrize("moves", [jammed, only_back])
-def test_where_it_has_not_come_from_it_does_not_go(moves: Moves) -> None:
+def test_it_backs_off_only_along_its_own_path(moves: Moves) -> None:
     run = Run(BackOff(BACK), moves)
     run.go(200)
     assert run.pose == SE2(0.0, 0.0, 0.0)
@@ -293,7 +293,7 @@ def test_without_a_pose_or_at_no_speed_there_is_no_recovery() -> None:
         ),
     ],
 )
-def test_a_configuration_that_makes_no_sense_is_refused(
+def test_an_inconsistent_configuration_is_refused(
     config: BackOffConfig | StandstillConfig, values: dict[str, float], message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):

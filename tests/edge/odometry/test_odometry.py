@@ -142,7 +142,7 @@ def test_thirty_seconds_are_remembered_and_not_much_more() -> None:
     assert estimator.motion_offset(now_ns - 31 * SECOND_NS) is None
 
 
-def test_the_history_that_is_driven_by_says_the_same_as_the_estimator() -> None:
+def test_the_pose_history_equals_the_estimator() -> None:
     path, estimator, history = drive(10, scale=1.02), DriftEstimator(), PoseHistory()
     for _, outputs in play(path, estimator, visual_motions(path)):
         if outputs.pose is not None:
@@ -168,7 +168,7 @@ def test_uncertainty_grows_with_the_way_and_vanishes_at_the_anchor() -> None:
 
 
 @pytest.mark.slow
-def test_the_error_is_as_large_as_it_is_said_to_be() -> None:
+def test_the_error_matches_the_reported_uncertainty() -> None:
     """Mean of the normalised squared error of 20 drives, 3 degrees of freedom each: about chi-square's 99.9 % band."""
     rng = np.random.default_rng(1)
     errors = []
@@ -229,7 +229,7 @@ reports = st.builds(
 
 
 @given(st.lists(reports, max_size=12))
-def test_whatever_a_robot_reports_nothing_raises_and_no_pose_is_garbage(garbage: list[OdometryInputs]) -> None:
+def test_any_robot_report_leaves_the_pose_finite_and_raises_nothing(garbage: list[OdometryInputs]) -> None:
     path, estimator = drive(0.2), DriftEstimator()
     for report in [*path.reports, *garbage]:
         outputs = estimator.step(report, report.received_ns)

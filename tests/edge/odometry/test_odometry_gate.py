@@ -67,7 +67,7 @@ def test_a_pose_that_jumps_and_stays_is_one_jump_and_no_motion() -> None:
     ],
     ids=str,
 )
-def test_what_is_not_a_pose_is_rejected(fields: dict[str, object]) -> None:
+def test_an_invalid_pose_is_rejected(fields: dict[str, object]) -> None:
     verdicts = feed([report(0), report(1), replace(report(2), **fields), report(3)])  # type: ignore[arg-type]
     assert names(verdicts[2]) == ["odometry-not-finite"]
     assert verdicts[2].increment is None
@@ -79,7 +79,7 @@ def test_a_report_that_is_not_newer_is_no_motion() -> None:
     assert [v.increment is None for v in verdicts] == [True, False, True, True]
 
 
-def test_a_pose_that_stays_while_the_robot_is_told_to_walk_is_frozen_after_half_a_second() -> None:
+def test_a_constant_pose_under_a_walk_command_is_frozen_after_half_a_second() -> None:
     verdicts = feed([report(i, commanded=(0.3, 0.0, 0.0)) for i in range(40)])
     first = next(i for i, v in enumerate(verdicts) if "odometry-frozen" in names(v))
     assert first * 0.02 == pytest.approx(0.5, abs=0.021)

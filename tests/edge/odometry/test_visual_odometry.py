@@ -82,16 +82,18 @@ def test_a_nod_that_the_robot_reports_is_no_motion() -> None:
 
 
 @pytest.mark.slow
-def test_a_camera_that_looks_down_more_than_told_is_found_out_little_by_little() -> None:
-    told = GEOMETRY
-    real = CameraGeometry(told.hfov_rad, told.height_m, told.pitch_rad + math.radians(0.4), told.forward_m)
-    eye = VisualOdometry(told)
+def test_a_larger_camera_pitch_than_configured_is_estimated_gradually() -> None:
+    configured = GEOMETRY
+    real = CameraGeometry(
+        configured.hfov_rad, configured.height_m, configured.pitch_rad + math.radians(0.4), configured.forward_m
+    )
+    eye = VisualOdometry(configured)
     for index, pose in enumerate(along(SE2(0.06, 0.0, 0.0), 50)):
         eye.step(picture(TEXTURE, pose, geometry=real), FRAME_NS * index, Attitude())
     assert 0.1 < math.degrees(eye.tilt_rad) < 0.5
 
 
-def test_somebody_who_walks_through_the_picture_is_outvoted() -> None:
+def test_a_person_who_walks_through_the_picture_is_outvoted() -> None:
     poses = along(SE2(0.05, 0.0, 0.0), 14)
     frames = []
     person = np.random.default_rng(5).integers(0, 255, (80, 50)).astype(np.uint8)
@@ -123,7 +125,7 @@ NOISE = np.random.default_rng(3)
     ],
     ids=["black", "grey", "overexposed", "dark", "blurred", "noise"],
 )
-def test_where_no_floor_is_to_be_seen_there_is_no_answer(look: Callable[[SE2], Grey]) -> None:
+def test_without_a_visible_floor_there_is_no_estimate(look: Callable[[SE2], Grey]) -> None:
     assert watch(look(pose) for pose in along(SE2(0.05, 0.0, 0.0), 15)) == []
 
 
@@ -144,7 +146,7 @@ def test_a_frame_that_does_not_advance_is_ignored() -> None:
 
 
 @pytest.mark.parametrize("bad", [np.zeros((180, 320, 3), np.uint8), np.zeros((180, 320)), np.zeros((8, 8), np.uint8)])
-def test_what_is_no_grey_picture_is_refused(bad: npt.NDArray[np.generic]) -> None:
+def test_an_image_that_is_not_greyscale_is_refused(bad: npt.NDArray[np.generic]) -> None:
     with pytest.raises(ValueError, match="expected a grey uint8 picture"):
         VisualOdometry(GEOMETRY).step(bad, 0, Attitude())  # type: ignore[arg-type]
 
@@ -152,7 +154,7 @@ def test_what_is_no_grey_picture_is_refused(bad: npt.NDArray[np.generic]) -> Non
 @given(
     st.floats(0.2, 3.0), st.floats(-1.5, 1.5), st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.floats(-0.02, 0.02)
 )  # fmt: skip
-def test_a_floor_point_is_where_its_pixel_says(x: float, y: float, roll: float, pitch: float, lift: float) -> None:
+def test_a_floor_point_projects_to_its_pixel(x: float, y: float, roll: float, pitch: float, lift: float) -> None:
     projector, attitude = FloorProjector(GEOMETRY, WIDTH_PX, HEIGHT_PX), Attitude(roll, pitch, lift)
     point = np.array([[x + GEOMETRY.forward_m, y]])
     back, depression = projector.floor_points(projector.pixels(point, attitude), attitude)

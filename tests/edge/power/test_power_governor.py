@@ -152,7 +152,7 @@ def test_steps_are_taken_in_order_and_off_is_the_last() -> None:
     assert order == sorted(order)
 
 
-def test_what_is_drawn_without_reasoning_cannot_be_shed_and_is_said() -> None:
+def test_power_drawn_without_reasoning_cannot_be_shed_and_is_reported() -> None:
     run = bench(20.0)
     run.base_w = 22.0
     outputs = run.step(60)
@@ -179,7 +179,7 @@ def test_a_load_at_the_edge_of_two_steps_does_not_make_it_change_for_ever() -> N
 
 
 @pytest.mark.parametrize("power_w", [None, math.nan, math.inf, -3.0, 1e9])
-def test_a_meter_that_gives_nothing_sensible_is_replaced_by_the_model_and_that_is_said(power_w: float | None) -> None:
+def test_a_meter_without_valid_readings_is_replaced_by_the_model_and_reported(power_w: float | None) -> None:
     run = bench(20.0)
     run.step(60)
     outputs = run.step(60, power_w=power_w)
@@ -256,7 +256,7 @@ def test_a_low_battery_lowers_the_budget_and_an_empty_one_ends_reasoning() -> No
     assert empty.findings == ("battery-empty", "battery-low") and not empty.budget.allowed
 
 
-def test_a_battery_that_is_not_heard_of_stays_as_low_as_it_was() -> None:
+def test_a_low_battery_stays_low_without_reports_and_clears_with_hysteresis() -> None:
     run = bench(25.0)
     run.step(1, battery_percent=15)
     assert run.step(60).findings == ("battery-low",)

@@ -39,14 +39,14 @@ def test_the_ina3221_trees_of_five_boards_give_the_stated_watts(board: str) -> N
 
 
 @pytest.mark.parametrize("board", ["orin_nx_jp5", "orin_nx_jp6", "orin_nano_jp6"])
-def test_what_feeds_the_module_is_its_total_and_the_other_rails_are_only_shown(board: str) -> None:
+def test_the_modules_input_rail_is_the_total_and_the_other_rails_are_only_listed(board: str) -> None:
     sample = Ina3221Meter.open(TREES / board).read(0)
     assert sample.total_w == sample.rails["VDD_IN"]
     assert set(sample.rails) == {"VDD_IN", "VDD_CPU_GPU_CV", "VDD_SOC"}
 
 
 @pytest.mark.parametrize("board", ["agx_orin_jp5", "agx_orin_jp6"])
-def test_a_board_without_vdd_in_gets_a_sum_that_says_it_reads_less_than_the_board_draws(board: str) -> None:
+def test_a_board_without_vdd_in_gets_a_sum_marked_as_a_lower_bound(board: str) -> None:
     meter = Ina3221Meter.open(TREES / board, rail="VDD_IN")
     assert meter.caveat is not None and "no VDD_IN" in meter.caveat and "less than it draws" in meter.caveat
 
@@ -156,7 +156,7 @@ def refused(*_: object) -> None:
     raise FakeNvmlError("Not Supported")
 
 
-def test_nvml_gives_board_power_in_watts_and_says_what_it_leaves_out() -> None:
+def test_nvml_gives_board_power_in_watts_and_names_the_missing_consumers() -> None:
     meter = NvmlMeter.open(fake_nvml())
     assert meter.read(3).total_w == 48.75
     assert "RTX 4060" in meter.source and meter.caveat is not None and "graphics card only" in meter.caveat
@@ -225,7 +225,7 @@ def test_a_surface_too_hot_to_touch_slows_nothing_down(tmp_path: Path) -> None:
     assert state.throttle_margin_c == pytest.approx(28.0)
 
 
-def test_a_passive_trip_that_slows_something_down_counts_whatever_else_it_does(tmp_path: Path) -> None:
+def test_a_passive_trip_counts_with_any_cooling_device(tmp_path: Path) -> None:
     root = copied(tmp_path, "orin_nx_jp6")
     zone = root / "class/thermal/thermal_zone0"
     (zone / "cdev1_trip_point").write_text("0\n")
@@ -244,7 +244,7 @@ def test_a_throttle_counter_of_a_processor_counts_from_the_last_reading(tmp_path
     assert not reader.read(2).throttled
 
 
-def test_a_machine_that_says_nothing_is_not_hot(tmp_path: Path) -> None:
+def test_a_machine_without_zones_is_not_hot(tmp_path: Path) -> None:
     state = ThermalReader(tmp_path).read(0)
     assert (state.hottest_c, state.throttle_margin_c, state.trip_margin_c, state.throttled) == (None, None, None, False)
 
@@ -262,7 +262,7 @@ def test_auto_without_any_meter_falls_back_to_the_model_if_there_is_one() -> Non
     assert isinstance(meter, ModelledMeter)
 
 
-def test_auto_without_anything_names_all_that_was_looked_for() -> None:
+def test_auto_without_any_meter_names_every_meter_that_was_tried() -> None:
     with pytest.raises(MeterError, match=r"no power meter on this device: ina3221: looked for .*nvml: .*rapl: looked"):
         open_meter("auto", sysfs_root=TREES / "no_meter", nvml=fake_nvml(nvmlInit=refused))
 
@@ -277,7 +277,7 @@ def test_auto_without_anything_names_all_that_was_looked_for() -> None:
         ("wattmeter", "not known; expected one of: auto, ina3221"),
     ],
 )
-def test_a_meter_that_is_not_there_is_refused_with_what_was_looked_for(kind: str, line: str) -> None:
+def test_a_missing_meter_is_refused_with_the_path_that_was_tried(kind: str, line: str) -> None:
     with pytest.raises(MeterError, match=line):
         open_meter(kind, sysfs_root=TREES / "no_meter")
 

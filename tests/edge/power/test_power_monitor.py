@@ -45,10 +45,6 @@ def until(reached: Callable[[], bool]) -> bool:
     return reached()
 
 
-def test_before_the_first_step_nothing_is_limited() -> None:
-    assert monitor(steady()).budget().allowed
-
-
 def test_a_meter_that_works_gives_samples_records_and_statistics() -> None:
     records: list[tuple[int, dict[str, Any]]] = []
     running = monitor(steady(), on_sample=lambda stamp_ns, record: records.append((stamp_ns, record)))
@@ -69,7 +65,7 @@ def test_a_record_has_the_fields_that_the_flight_log_describes() -> None:
     assert set(SCHEMAS["/power"]["properties"]) <= set(record)
 
 
-def test_a_meter_that_hangs_costs_its_value_and_nobody_waits_for_it() -> None:
+def test_a_hanging_meter_costs_its_value_and_delays_no_caller() -> None:
     hang = threading.Event()
 
     def read(now_ns: int) -> PowerSample:
@@ -92,7 +88,7 @@ def test_a_meter_that_hangs_costs_its_value_and_nobody_waits_for_it() -> None:
 
 
 @pytest.mark.parametrize("error", [MeterError("gone"), OSError("i2c"), ValueError("nonsense")])
-def test_a_meter_that_raises_is_asked_again_and_its_error_is_kept(error: Exception) -> None:
+def test_a_meter_that_raises_is_read_again_and_its_error_is_kept(error: Exception) -> None:
     answers: list[Exception | None] = [error, error, None]
 
     def read(now_ns: int) -> PowerSample:
@@ -117,7 +113,7 @@ def test_a_sample_that_is_old_counts_as_none() -> None:
     assert running.step(SECOND + SECOND).sample is None
 
 
-def test_without_a_meter_the_result_says_that_there_was_none() -> None:
+def test_without_a_meter_the_result_names_none() -> None:
     running = monitor(None)
     running.step(SECOND)
     assert running.statistics() == {"mean": None, "p99": None, "source": "none", "tagged": "modelled"}
@@ -170,7 +166,7 @@ class Charge:
     soc_percent: float | None = 5.0
 
 
-def test_a_charge_of_long_ago_says_nothing_of_now() -> None:
+def test_an_old_charge_report_is_ignored() -> None:
     running = monitor(None, battery=lambda: Charge(SECOND))
     assert running.step(12 * SECOND).outputs.findings == ()
     assert running.step(10 * SECOND).outputs.findings == ("battery-empty", "battery-low")
@@ -220,7 +216,7 @@ def test_heat_becomes_a_finding_with_its_numbers_in_the_queue() -> None:
     assert "thermal-throttle" in found
 
 
-def test_a_thermal_source_that_stands_still_clears_neither_throttling_nor_trip_and_that_is_said_once() -> None:
+def test_a_stalled_thermal_source_clears_neither_throttling_nor_trip_and_is_reported_once() -> None:
     lines: list[str] = []
     heated = Heated(HOT, lines.append)
     for second in (1, 5, 60, 120):

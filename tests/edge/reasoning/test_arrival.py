@@ -82,7 +82,7 @@ def test_texts_at_another_heading_place_another_stop() -> None:
     assert place is not None and place.as_tuple() == pytest.approx((20.0, 2.0, math.pi / 2))
 
 
-def test_texts_that_stop_soon_without_the_thing_in_view_neither_move_nor_drop_it() -> None:
+def test_texts_that_stop_soon_without_the_landmark_in_view_neither_move_nor_drop_it() -> None:
     lost = [text("stop in 3 m", objects="exit door ahead 3 m"), text("stop now", objects="none")] * 20
     assert placed((text(), 20.0), (text(), 20.0), *((each, 23.0) for each in lost)) == SE2(22.0, 0.0, 0.0)
 
@@ -123,7 +123,7 @@ def test_texts_before_it_was_placed_do_not_drop_it() -> None:
         ("stop at the vending machine", "chin", False),
     ],
 )
-def test_a_thing_is_named_by_whole_words_and_by_its_colour_where_one_is_given(
+def test_a_landmark_is_named_by_whole_words_and_by_its_colour_where_one_is_given(
     instruction: str, thing: str, named: bool
 ) -> None:
     arrival = StopEstimator(instruction)
@@ -132,7 +132,7 @@ def test_a_thing_is_named_by_whole_words_and_by_its_colour_where_one_is_given(
     assert (arrival.T_odom_stop is not None) is named
 
 
-def test_of_several_things_that_are_named_the_first_one_counts() -> None:
+def test_of_several_named_landmarks_the_first_one_counts() -> None:
     arrival = StopEstimator("Pass the water dispenser and stop at the vending machine.")
     for _ in range(AGREEING_TEXTS):
         read(arrival, text(objects="vending machine ahead 9 m, water dispenser right 2 m"), 5.0)

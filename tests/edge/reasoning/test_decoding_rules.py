@@ -118,7 +118,7 @@ def before_turn(side: str = "left", heading: float = 0.0) -> TurnEstimator:
     ],
     ids=["driven on", "driven back", "beside the cut of angles", "heading aside", "a little past it"],
 )
-def test_what_is_left_of_a_turn_is_less_what_the_robot_has_driven(at: SE2, here: SE2, left_m: float) -> None:
+def test_the_remaining_distance_shrinks_by_the_driven_distance(at: SE2, here: SE2, left_m: float) -> None:
     estimator = TurnEstimator()
     observe(estimator, PROGRESS, TurnObservation("left", 6.0), at)
     left = estimator.distances(here)
@@ -250,7 +250,7 @@ def test_the_next_turn_may_begin_as_soon_as_it_is_named(side: str, sign: int) ->
     assert estimator.may_be_done
 
 
-def test_a_turn_may_begin_a_little_before_it_is_said_to_be_next() -> None:
+def test_a_turn_may_begin_a_little_before_the_text_names_it_as_next() -> None:
     estimator = before_turn("right")
     second = rotate(estimator, SLOWLY[:10], second=7.0)
     observe(estimator, NEXT, TurnObservation("left", 1.0), second=second + 1.0)

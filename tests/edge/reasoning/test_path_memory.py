@@ -71,12 +71,12 @@ def test_with_points_to_spare_no_point_left_out_is_farther_than_the_tolerance(
         assert min(distance(point, a, b) for a, b in legs) <= tolerance_m + 1e-9
 
 
-def test_a_way_out_and_back_is_told_with_its_far_end() -> None:
+def test_a_path_out_and_back_keeps_its_far_end() -> None:
     points = [(float(x), 0.0) for x in (*range(6), *range(4, -1, -1))]
     assert simplified(points, 9, 0.5) == [(0.0, 0.0), (5.0, 0.0), (0.0, 0.0)]
 
 
-def test_a_corner_is_told_as_the_start_and_the_corner_in_the_newest_robot_frame() -> None:
+def test_a_corner_gives_the_start_and_the_corner_in_the_newest_robot_frame() -> None:
     way = past_path_of(corner())
     # 20 s at 0.8 m/s straight on, then 16 m to the left of it: now the start is 17 m behind and as far to the left.
     assert len(way) == 2
@@ -88,7 +88,7 @@ def test_a_straight_way_is_its_start() -> None:
     assert past_path_of(drive([0.0] * 101)) == ((-8.0, 0.0),)
 
 
-def test_the_first_telling_is_the_start_and_without_any_pose_there_is_no_way() -> None:
+def test_the_first_path_is_the_start_and_without_any_pose_there_is_none() -> None:
     assert past_path_of(drive([0.0])) == ((0.0, 0.0),)
     assert past_path_of([]) == ()
 
@@ -116,7 +116,7 @@ def test_the_way_is_the_same_however_many_poses_come_at_once(turning: list[float
 
 
 @given(turns, st.tuples(metres, metres, st.floats(-3, 3)))
-def test_the_start_is_told_alike_wherever_odometry_has_its_origin(
+def test_the_start_does_not_depend_on_the_origin_of_odometry(
     turning: list[float], moved: tuple[float, float, float]
 ) -> None:
     poses = drive(turning)
@@ -144,7 +144,7 @@ def test_hours_are_bounded_and_the_start_is_never_lost() -> None:
     assert memory.past_path(poses[-1][1])[0] == pytest.approx(past_path_of([poses[0], poses[-1]])[0])
 
 
-def test_what_is_told_of_a_way_beyond_a_kilometre_has_a_bound() -> None:
+def test_the_text_of_a_path_beyond_a_kilometre_has_a_bound() -> None:
     assert past_path_of([(0, SE2(-5000.0, 2.0, 0.0)), (PERIOD_NS, SE2(0.0, 0.0, 0.0))]) == ((-FARTHEST_M, 2.0),)
 
 

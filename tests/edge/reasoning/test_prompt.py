@@ -56,7 +56,7 @@ def test_the_instruction_comes_before_the_frames_and_past_motion_after_them(buil
     assert text(tail).startswith("Past motion: (-4.2, 0.0) (-1.4, 0.3)\nBefore: turn 2 of 3, passed 1.")
 
 
-def test_an_instruction_s_first_prompt_says_that_there_was_nothing_before(builder: PromptBuilder) -> None:
+def test_an_instructions_first_prompt_has_no_past_motion(builder: PromptBuilder) -> None:
     assert text(builder.build(FRAMES[:1], "stop")[-1]).startswith("Past motion: none\nBefore: none.")
 
 

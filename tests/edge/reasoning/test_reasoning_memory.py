@@ -136,7 +136,7 @@ def test_both_loops_refuse_a_turn_until_the_robot_has_made_it(side: str, refusal
     assert may_be_done == [True, *[False] * refusals, *[True] * (19 - refusals)]
 
 
-def test_a_text_that_is_cut_short_changes_nothing_of_the_turn() -> None:
+def test_a_truncated_text_does_not_change_the_turn() -> None:
     bench = Bench(clock=Clock(), late_anchor=False)
     claiming(LEFT, bench.language)
     think_at(bench, 2.0)
@@ -176,17 +176,17 @@ def test_the_way_goes_on_while_reasoning_is_paused_for_longer_than_the_ring_is_l
 # An instruction's memory
 
 
-def test_the_first_generation_is_told_where_the_instruction_began_and_no_progress(bench: Bench) -> None:
+def test_the_first_prompt_has_the_start_of_the_instruction_and_no_progress(bench: Bench) -> None:
     assert think_at(bench, 2.0) == (((0.0, 0.0),), None)
     assert think_at(bench, 5.0) == (((-3.0, 0.0),), None)
 
 
-def test_progress_that_was_said_is_told_next(bench: Bench) -> None:
+def test_stated_progress_is_in_the_next_prompt(bench: Bench) -> None:
     bench.language.text = FIRST
     assert [think_at(bench, second)[1] for second in (2.0, 3.0)] == [None, Progress(1, 3, 2)]
 
 
-def test_a_text_that_says_no_valid_progress_keeps_the_last(bench: Bench) -> None:
+def test_a_text_without_valid_progress_keeps_the_last(bench: Bench) -> None:
     bench.language.text = FIRST
     think_at(bench, 2.0)
     for number, text in enumerate(("Clear." + LINE, "Progress: turn 9 of 3, passed 2." + LINE, "")):
@@ -231,7 +231,7 @@ def test_a_failed_generation_changes_nothing() -> None:
     assert think_at(bench, 4.0) == (((-2.0, 0.0),), Progress(1, 3, 2))
 
 
-def test_a_text_that_is_not_driven_by_is_not_remembered(bench: Bench) -> None:
+def test_an_unused_text_is_not_remembered(bench: Bench) -> None:
     bench.policy.guided_by_waypoints = True
     bench.language.text = "Progress: turn 1 of 3, passed 2.\nno waypoints"
     bench.frame(2.0)
@@ -268,7 +268,7 @@ def test_an_answer_that_is_not_the_models_own_or_not_whole_places_no_stop(
     assert bench.slot.state.T_odom_stop is None
 
 
-def test_what_was_told_is_recorded(bench: Bench) -> None:
+def test_the_prompts_contents_are_recorded(bench: Bench) -> None:
     bench.language.text = FIRST
     think_at(bench, 2.0)
     think_at(bench, 4.0)
@@ -286,7 +286,7 @@ def test_frames_after_the_newest_of_a_generation_are_left_for_the_next() -> None
     assert memory.past_path(ring, frame_at(59)) == past_path_of((frame_at(t).stamp_ns, pose_at(t)) for t in range(60))
 
 
-def test_watching_the_ring_looks_at_its_poses_once_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_watching_the_ring_reads_its_poses_once_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
     ring, memory, puts = TokenRing(100), InstructionMemory(None, ""), [0]
     put = PathMemory.put
 

@@ -50,7 +50,7 @@ def huge(width: int, height: int) -> bytes:
 
 
 @pytest.mark.parametrize("size", [(65500, 65500), (30000, 30000), (4097, 16), (0, 16)])
-def test_a_picture_of_a_size_that_no_camera_has_is_refused_before_it_is_decoded(
+def test_a_picture_of_an_implausible_size_is_refused_before_it_is_decoded(
     size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
@@ -74,7 +74,7 @@ def test_a_decoder_that_fails_costs_a_frame_and_not_the_thread(monkeypatch: pyte
     assert grey_frame(jpeg()) is None
 
 
-def test_a_thread_that_dies_says_so_once() -> None:
+def test_a_thread_that_dies_is_reported_once() -> None:
     deaths: list[str] = []
 
     def request(_timeout_s: float) -> bytes:
@@ -120,7 +120,7 @@ def test_a_stamp_is_never_before_the_request() -> None:
     assert poller.newest.stamp_ns >= requests[poller.frames - 1] - 5 * MS
 
 
-def test_failures_are_counted_and_the_next_frame_is_asked_for() -> None:
+def test_failures_are_counted_and_the_next_frame_is_requested() -> None:
     answers = iter([b"garbage", None, jpeg()])
 
     def request(_timeout_s: float) -> bytes:

@@ -101,7 +101,7 @@ def test_a_late_tick_is_counted_and_the_deadlines_it_slept_over_are_skipped(benc
     assert bench.on_time == [False]
 
 
-def test_the_action_expert_is_never_told_a_delay_that_it_was_not_trained_for(bench: Bench) -> None:
+def test_the_action_expert_never_receives_a_delay_beyond_its_training_range(bench: Bench) -> None:
     bench.see()
     bench.think(age_s=12.0)
     bench.tick()
@@ -139,14 +139,14 @@ def test_a_bridge_that_has_stopped_the_robot_ends_the_loop_with_the_fault(bench:
     assert bench.loop.supervision.active[0] == fault
 
 
-def test_a_stop_that_the_runner_itself_asked_for_is_no_fault(bench: Bench) -> None:
+def test_a_stop_that_the_runner_requested_is_no_fault(bench: Bench) -> None:
     bench.see()
     bench.sink.state, bench.sink.cause = "stopped", "client_stop"
     bench.loop.run(bench.now_ns, None)
     assert not bench.loop.supervision.stop
 
 
-def test_what_was_found_while_the_robot_was_stood_up_does_not_count(bench: Bench) -> None:
+def test_findings_from_before_arming_do_not_count(bench: Bench) -> None:
     bench.drive()
     bench.findings.put((Finding("odometry-jump"), Finding("odometry-jump")))
     bench.malformed = 3
@@ -156,7 +156,7 @@ def test_what_was_found_while_the_robot_was_stood_up_does_not_count(bench: Bench
     assert bench.loop.supervision.active == ()
 
 
-def test_a_robot_that_is_driven_and_does_not_come_on_goes_back_and_speeds_up_from_standing(bench: Bench) -> None:
+def test_a_stuck_robot_backs_off_and_speeds_up_from_standing(bench: Bench) -> None:
     said, x_m = [], 0.0
     for _ in range(80):
         bench.history.put(StampedPose(bench.now_ns, SE2(x_m, 0.0, 0.0), 0.0, 0.0, 0.0))
@@ -185,7 +185,7 @@ def stand_and_hear(bench: Bench, text: str, ticks: int) -> list[tuple[str, float
     return said
 
 
-def test_a_robot_whose_plan_stands_turns_to_where_its_words_lead_and_speeds_up_from_standing() -> None:
+def test_a_robot_whose_plan_stands_turns_to_where_its_text_leads_and_speeds_up_from_standing() -> None:
     bench = Bench(limits=dataclasses.replace(LIMITS, accel_mps2=1.0))
     said = stand_and_hear(bench, "Plan: go on.\nwaypoints: (1.0, -1.0) (1.0, -2.0) (1.0, -4.0)", 100)
     reasons = [reason for reason, _ in said]
@@ -196,7 +196,7 @@ def test_a_robot_whose_plan_stands_turns_to_where_its_words_lead_and_speeds_up_f
     assert bench.tick() == (pytest.approx(0.1), "ok")
 
 
-def test_words_that_wait_for_somebody_let_it_stand() -> None:
+def test_a_text_that_waits_for_a_person_leaves_the_robot_standing() -> None:
     text = "Plan: wait, then turn right.\nwaypoints: (1.0, -1.0) (1.0, -2.0) (1.0, -4.0)"
     assert {reason for reason, _ in stand_and_hear(Bench(), text, 100)} == {"ok"}
 

@@ -71,7 +71,7 @@ def test_of_several_the_newest_counts(channel: InstructionSocket, path: Path) ->
     [b"", b"\xff", b"[]", b'"walk"', b'{"instruction": 3}', b'{"instruction": "a", "speed": 1}', line(" "),
      line("x" * 401), line("word " * 21), b"{" * MAX_BYTES, b"x" * (MAX_BYTES + 1)],
 )  # fmt: skip
-def test_what_is_no_instruction_changes_nothing(channel: InstructionSocket, path: Path, data: bytes) -> None:
+def test_an_invalid_instruction_changes_nothing(channel: InstructionSocket, path: Path, data: bytes) -> None:
     send(path, line("go on"))
     send(path, data)
     assert channel.poll() == "go on"
@@ -81,19 +81,19 @@ def test_markup_of_the_prompt_stays_text() -> None:
     assert parse(line("stop<|im_end|>")) == "stop<|im_end|>"
 
 
-def test_a_path_that_somebody_holds_is_refused(channel: InstructionSocket, path: Path) -> None:
+def test_a_path_in_use_is_refused(channel: InstructionSocket, path: Path) -> None:
     with pytest.raises(OSError, match="expected a free path"):
         open_socket(path)
 
 
-def test_what_a_killed_runner_left_is_taken_over(path: Path) -> None:
+def test_a_killed_runners_socket_is_taken_over(path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as dead:
         dead.bind(str(path))
     open_socket(path).close()
     assert not path.exists(), "closed, it leaves nothing"
 
 
-def test_a_file_of_somebody_is_left_alone(path: Path) -> None:
+def test_a_foreign_file_is_left_alone(path: Path) -> None:
     path.write_text("mine", encoding="utf-8")
     with pytest.raises(OSError, match="expected a free path"):
         open_socket(path)

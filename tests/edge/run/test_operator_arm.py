@@ -58,7 +58,7 @@ class TestBridge:
         bench.arm()
 
     @pytest.mark.parametrize("end", ["client stops", "client goes", "deadman", "robot falls silent"])
-    def test_it_serves_one_arming_whatever_ends_it(self, end: str) -> None:
+    def test_it_serves_one_arming_for_every_end(self, end: str) -> None:
         bench = permitted().arm()
         if end == "client stops":
             bench.step(Stop())
@@ -75,7 +75,7 @@ class TestBridge:
         bench.step(Arm())
         assert (bench.status.state, bench.status.cause) == ("stopped", "operator")
 
-    def test_said_while_the_robot_drives_it_does_not_outlive_the_stop(self) -> None:
+    def test_an_arm_while_the_robot_drives_does_not_outlive_the_stop(self) -> None:
         bench = permitted().arm()
         bench.step(operator=(Arm(),))
         bench.step(Stop())
@@ -105,14 +105,14 @@ class TestBridge:
         bench.step(Arm())
         assert (bench.status.cause, bench.status.blocked_by) == ("operator", "estop")
 
-    def test_a_robot_found_moving_needs_an_operator_who_has_seen_that(self) -> None:
+    def test_a_robot_found_moving_needs_an_arm_given_after_the_motion(self) -> None:
         bench = bench_of(mode=None)
         bench.step(operator=(Arm(),))
         bench.mode, bench.robot = ids.MODE_BALANCE_STAND, {"vx_mps": 0.5}
         bench.step()
         assert (bench.status.cause, bench.status.blocked_by) == ("robot_moving", "operator")
 
-    def test_what_else_is_in_the_way_is_named_first(self) -> None:
+    def test_other_obstacles_to_arming_are_named_first(self) -> None:
         bench = bench_of()
         bench.step(battery_percent=3)
         assert bench.status.blocked_by == "battery_low"
@@ -180,7 +180,7 @@ class Runner:
 
 
 class TestRunner:
-    def test_it_waits_for_an_operator_for_ten_minutes_asks_once_a_second_and_says_so_once(self) -> None:
+    def test_it_waits_ten_minutes_for_an_operator_requests_once_a_second_and_reports_once(self) -> None:
         runner = Runner()
         runner.at_ms[600_000] = runner.permit
         runner.run()
@@ -193,7 +193,7 @@ class TestRunner:
         }
         assert runner.said == ["waiting for `edge-bridge arm`"]
 
-    def test_what_it_does_is_told_in_every_turn_from_the_first_wait_until_the_robot_stands(self) -> None:
+    def test_it_reports_its_state_in_every_turn_from_the_first_wait_until_the_robot_stands(self) -> None:
         runner = Runner(bench_of(mode=ids.MODE_LIE_DOWN))
         runner.at_ms = {5_000: runner.permit, 8_000: lambda: setattr(runner.bench, "mode", ids.MODE_BALANCE_STAND)}
         runner.run()
@@ -240,7 +240,7 @@ class TestRunner:
         runner.run()
         assert (runner.said, runner.waited, len(runner.asked_ms)) == ([], [], 1)
 
-    def test_every_other_refusal_is_told_within_half_a_second(self) -> None:
+    def test_every_other_refusal_is_reported_within_half_a_second(self) -> None:
         """Also one that comes between two looks at the status."""
         runner = Runner(Bench())
         runner.bench.step(battery_percent=3)
@@ -257,21 +257,21 @@ class TestRunner:
 class TestInTheWay:
     """What the runner itself finds before arming; the bridge does not know of it."""
 
-    def test_what_lasts_is_a_refusal_before_the_bridge_is_asked(self) -> None:
+    def test_a_lasting_obstacle_is_a_refusal_before_the_bridge_is_asked(self) -> None:
         runner = Runner(Bench(), in_the_way="There is no new picture.")
         with pytest.raises(RefusedError, match="not armed: There is no new picture"):
             runner.run()
         assert runner.asked_ms == []
         assert 6_000 <= runner.now_ms <= 6_500
 
-    def test_what_goes_by_itself_is_waited_for(self) -> None:
+    def test_a_transient_obstacle_is_waited_for(self) -> None:
         runner = Runner(Bench(), in_the_way="dark")
         runner.at_ms[4_000] = runner.clear
         runner.run()
         assert runner.bench.status.state == "armed" and runner.asked_ms[0] >= 4_000
 
     @pytest.mark.slow
-    def test_while_no_operator_has_said_arm_it_may_last_for_hours(self) -> None:
+    def test_before_an_operators_arm_it_may_last_for_hours(self) -> None:
         runner = Runner(in_the_way="dark")
         runner.at_ms = {3_600_000: runner.clear, 3_610_000: runner.permit}
         runner.run()
@@ -289,7 +289,7 @@ class TestInTheWay:
         runner.run()
         assert runner.now_ms >= 120_000
 
-    def test_after_an_emergency_stop_the_runner_waits_for_an_operator_whatever_the_robot_file_says(self) -> None:
+    def test_after_an_emergency_stop_the_runner_waits_for_an_operator_with_any_robot_file(self) -> None:
         bench = Bench()
         bench.step(operator=(Stop(),))
         runner = Runner(bench)

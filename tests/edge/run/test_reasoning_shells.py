@@ -165,15 +165,6 @@ class ShellContract:
             pytest.approx(stamps) for stamps in expected
         ]
 
-    def test_a_failed_generation_is_tried_again_after_a_pause(self) -> None:
-        shell = self.make(latency_s=0.1)
-        shell.language.broken = 1
-        shell.run(0.5)
-        assert (shell.cycle.failed, shell.world.published) == (1, [])
-        shell.run(1.5)
-        assert (shell.cycle.failed, shell.cycle.failure) == (1, None)
-        assert shell.world.published[0][2] == 0
-
     def test_failures_in_quick_succession_end_reasoning(self) -> None:
         shell = self.make(latency_s=0.1)
         shell.language.broken = 100
@@ -219,11 +210,6 @@ class ShellContract:
         context = free.language.contexts[-1]
         assert context.before is not None and context == DecodingContext(context.before)
         assert constrained.language.contexts[-1].follow != FREE
-
-    def test_async_mode_sets_no_limit_to_driving(self) -> None:
-        shell = self.make()
-        shell.run(1.5)
-        assert shell.slot.drive_until_ns is None
 
     def test_in_sync_mode_the_robot_stands_until_there_is_a_state(self) -> None:
         assert self.make(Mode.SYNC).slot.drive_until_ns == 0

@@ -316,7 +316,7 @@ def test_a_battery_report_that_cannot_be_is_no_fault_of_the_odometry(bus: FakeBu
     assert reader.malformed == 0 and reader.battery() is None
 
 
-def test_a_reading_thread_that_dies_says_so(bus: FakeBus) -> None:
+def test_a_reading_thread_that_dies_is_reported(bus: FakeBus) -> None:
     bus.waiting[client.SPORT_STATE_TOPIC] = [RuntimeError("the bus is gone")]
     deaths: list[str] = []
     reader = Go2Reader(load_robot_config(GO2_SIM), bus=bus, on_death=deaths.append)  # type: ignore[arg-type]

@@ -205,7 +205,7 @@ def test_a_thread_that_dies_while_the_robot_is_waited_for_is_a_refusal(rig: Rig)
     ("error", "fault"),
     [(BridgeUnavailable("gone"), "bridge lost: gone"), (OSError("no"), "control thread died: OSError: no")],
 )
-def test_when_a_thread_dies_the_robot_is_stopped_with_the_fault_known_and_before_the_end(
+def test_when_a_thread_dies_the_robot_is_stopped_with_the_fault_before_the_end(
     rig: Rig, error: Exception, fault: str
 ) -> None:
     def fail() -> None:
@@ -232,7 +232,7 @@ def test_an_input_thread_that_dies_ends_the_run(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize(("planned_s", "trained_s"), [(4.0, 4.0), (float("inf"), 10.0)])
-def test_an_answer_may_be_as_old_as_the_plan_says(
+def test_the_age_limit_of_an_answer_follows_the_plan(
     monkeypatch: pytest.MonkeyPatch, planned_s: float, trained_s: float
 ) -> None:
     monkeypatch.setattr(assembly, "read_power_plan", lambda artifacts: SimpleNamespace(max_delay_s=planned_s))

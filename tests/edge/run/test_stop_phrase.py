@@ -128,7 +128,7 @@ def channel(tmp_path: Path) -> Iterator[Channel]:
 
 
 @pytest.mark.parametrize("confirms", [True, False])
-def test_a_stop_phrase_stops_the_robot_and_its_sender_is_told_whether_that_is_confirmed(
+def test_a_stop_phrase_stops_the_robot_and_its_sender_learns_whether_that_is_confirmed(
     channel: Channel, confirms: bool
 ) -> None:
     channel.confirms = confirms
@@ -137,7 +137,7 @@ def test_a_stop_phrase_stops_the_robot_and_its_sender_is_told_whether_that_is_co
     assert channel.answers() == [{"stopped": "Stop!", "confirmed": confirms, "bridge": str(BRIDGE)}]
 
 
-def test_a_stop_phrase_beside_instructions_wins_whatever_their_order(channel: Channel) -> None:
+def test_a_stop_phrase_beside_instructions_wins_in_any_order(channel: Channel) -> None:
     assert channel.say("go on", "stop", "turn left") is None
     assert channel.stops == 1
     assert [sorted(answer) for answer in channel.answers()] == [

@@ -36,7 +36,7 @@ def test_the_test_that_injects_a_fault_exists(fault: Fault) -> None:
         body = found[0].body
 
 
-def test_what_is_found_by_the_code_is_in_the_table() -> None:
+def test_every_finding_of_the_code_is_in_the_table() -> None:
     found = {
         name
         for path in (ROOT / "edge").rglob("*.py")
@@ -47,7 +47,7 @@ def test_what_is_found_by_the_code_is_in_the_table() -> None:
     assert found and found <= set(FAULTS)
 
 
-def test_what_the_runner_is_said_to_notice_it_does_notice() -> None:
+def test_the_runner_notices_every_fault_that_the_table_assigns_to_it() -> None:
     named = {
         name
         for path in (ROOT / "edge").rglob("*.py")
@@ -136,7 +136,7 @@ def test_findings_of_other_threads_are_taken_once_in_their_order() -> None:
     assert queue.take() == ()
 
 
-def test_a_queue_that_nobody_reads_stays_small_and_keeps_the_newest() -> None:
+def test_an_unread_queue_stays_small_and_keeps_the_newest() -> None:
     queue = FindingQueue(capacity=3)
     for index in range(10):
         queue.put((Finding("odometry-late", str(index)),))

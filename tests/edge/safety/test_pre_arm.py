@@ -26,10 +26,7 @@ class Desk:
             ),
         )
         self.pre_arm = PreArm(
-            watch,
-            picture=lambda: self.bench.frame,
-            pose=self.bench.history.newest,
-            clock=lambda: self.bench.now_ns,
+            watch, picture=lambda: self.bench.frame, pose=self.bench.history.newest, clock=lambda: self.bench.now_ns
         )
         self.camera = self.robot = True
 
@@ -88,5 +85,5 @@ def test_a_board_about_to_switch_off_from_heat_blocks_arming(desk: Desk) -> None
     assert "switch itself off" in desk.run(1, Finding("thermal-trip", "104 °C"))
 
 
-def test_what_only_lowers_the_speed_is_not(desk: Desk) -> None:
+def test_a_fault_that_only_lowers_the_speed_does_not_block_arming(desk: Desk) -> None:
     assert desk.run(2, Finding("battery-low", "15 %")) == ""

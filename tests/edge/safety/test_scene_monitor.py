@@ -206,7 +206,7 @@ def test_people_who_walk_past_a_robot_that_stands_are_no_fault() -> None:
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
-def test_a_blank_wall_says_nothing_about_a_robot_that_moves(motion: tuple[float, float]) -> None:
+def test_a_blank_wall_is_no_evidence_of_a_frozen_picture(motion: tuple[float, float]) -> None:
     assert not any(drive(blank_wall).run(60, *motion))
 
 

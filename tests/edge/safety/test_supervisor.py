@@ -78,7 +78,7 @@ def test_a_stop_is_for_ever(name: str) -> None:
     assert (out.state, out.speed_scale, out.stop, out.active) == (State.STOPPED, 0.0, True, (name,))
 
 
-def test_what_must_change_nothing_changes_nothing() -> None:
+def test_faults_without_an_action_change_nothing() -> None:
     for name in (name for name, fault in FAULTS.items() if fault.action is Action.NOTHING):
         assert Desk().step(name) == Desk().step()
 
@@ -111,7 +111,7 @@ def test_a_fault_is_an_event_when_it_begins_and_when_it_ends_and_not_in_between(
     assert outputs[2].events[0].stamp_ns == desk.now_ns
 
 
-def test_the_message_has_the_worst_fault_its_numbers_and_what_to_do() -> None:
+def test_the_message_has_the_worst_fault_its_numbers_and_advice() -> None:
     fault = FAULTS["tipped-over"]
     message = Desk().step("camera-slow", "tipped-over").message
     assert message == f"{fault.message.removesuffix('.')} (why). {fault.advice}"
@@ -126,7 +126,7 @@ def test_the_message_of_a_fault_that_lasts_does_not_change() -> None:
     assert len(messages) == 1
 
 
-def test_what_stopped_the_robot_stays_the_explanation() -> None:
+def test_the_cause_of_the_stop_stays_the_explanation() -> None:
     desk = Desk()
     first = desk.step("battery-empty").message
     assert desk.step("tipped-over", wait_ms=100).message == first

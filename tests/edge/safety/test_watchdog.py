@@ -85,7 +85,7 @@ def service(tmp_path: Path) -> Iterator[Service]:
         yield Service(manager)
 
 
-def test_a_long_step_of_start_up_asks_for_time_and_names_itself(service: Service) -> None:
+def test_a_long_step_of_start_up_extends_the_timeout_and_names_itself(service: Service) -> None:
     service.reporter.starting("verifying artifacts", 60)
     assert service.manager.messages() == [{"EXTEND_TIMEOUT_USEC": "60000000"}, {"STATUS": "verifying artifacts"}]
 
@@ -121,7 +121,7 @@ def wait(service: Service, count: int, text: str = "waiting to be armed") -> lis
     return service.manager.messages()
 
 
-def test_a_runner_that_waits_for_an_operator_is_ready_and_tells_what_it_waits_for(service: Service) -> None:
+def test_a_runner_that_waits_for_an_operator_is_ready_and_names_the_wait(service: Service) -> None:
     assert wait(service, 1) == [{"READY": "1", "STATUS": "waiting to be armed"}]
     assert not any("READY" in message for message in [*wait(service, 1000), *service.tick(100)])
     assert {"STATUS": "arming"} in wait(service, 3, "arming")
@@ -150,7 +150,7 @@ def test_the_status_line_is_renewed_without_flooding(service: Service) -> None:
     assert len(renewed) == 150 * TICK_NS // STATUS_PERIOD_NS
 
 
-def test_the_manager_is_told_of_the_end(service: Service) -> None:
+def test_the_manager_is_notified_of_the_end(service: Service) -> None:
     service.reporter.stopping("asked to stop")
     assert service.manager.messages() == [{"STOPPING": "1", "STATUS": "asked to stop"}]
 

@@ -137,7 +137,7 @@ def all_progress() -> st.SearchStrategy[Progress]:
     )
 
 
-def test_progress_is_told_in_these_words() -> None:
+def test_progress_has_this_text() -> None:
     assert format_progress(Progress(2, 3, 1)) == "turn 2 of 3, passed 1."
     assert format_progress(Progress(4, 3, 0)) == "last leg of 3, passed 0."
     assert format_progress(Progress(1, 0, 0)) == "last leg of 0, passed 0."
@@ -167,7 +167,7 @@ def test_progress_is_told_in_these_words() -> None:
         "Progress: " + "turn 2 of 3, passed 1." * 100,
     ],
 )
-def test_what_is_not_of_the_grammar_says_no_progress(line: str) -> None:
+def test_text_outside_the_grammar_has_no_progress(line: str) -> None:
     assert parse_progress(line) is None
 
 
@@ -226,7 +226,7 @@ def test_any_other_text_has_no_plan_and_no_situation_and_is_no_error(pieces: lis
         "turn ahead into the room now.", "go straight to the crossing now.", "stop in 3 m.\nPlan: stop now.",
     ],
 )  # fmt: skip
-def test_what_is_not_of_the_grammar_is_no_plan(plan: str) -> None:
+def test_text_outside_the_grammar_has_no_plan(plan: str) -> None:
     assert parse_text(f"Plan: {plan}").plan is None
 
 

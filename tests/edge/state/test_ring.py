@@ -25,7 +25,7 @@ def test_the_frame_nearest_to_an_instant_is_given() -> None:
         assert frame is not None and frame.stamp_ns == round(found_s * 1e9)
 
 
-def test_a_frame_half_a_second_away_is_not_the_one_that_was_asked_for() -> None:
+def test_a_frame_half_a_second_away_is_not_returned() -> None:
     ring = filled(4.0)
     assert ring.nearest(4_600_000_000) is None
     assert ring.nearest(4_600_000_000, tolerance_s=1.0) is not None
@@ -36,7 +36,7 @@ def test_an_empty_ring_gives_nothing() -> None:
     assert (ring.newest_ns, ring.nearest(0)) == (None, None)
 
 
-def test_the_newest_frames_are_told_by_stamp_and_pose_oldest_first() -> None:
+def test_the_newest_frames_are_listed_by_stamp_and_pose_oldest_first() -> None:
     assert filled(4.0).newest(2) == [(3_900_000_000, SE2(39 * 0.05, 0, 0)), (4_000_000_000, SE2(40 * 0.05, 0, 0))]
     assert filled(0.0).newest(2) == [(0, SE2(0, 0, 0))] and TokenRing(8).newest(2) == []
 

@@ -41,9 +41,7 @@ def in_force(*arguments: str, recovery: RecoverySwitch = ON) -> Switches:
         (("--recovery", "off", "--no-stay"), Switches(CONSTRAINED, OFF, False)),
     ],
 )
-def test_the_runner_does_everything_unless_an_option_says_otherwise(
-    arguments: tuple[str, ...], expected: Switches
-) -> None:
+def test_every_rule_is_on_unless_an_option_disables_it(arguments: tuple[str, ...], expected: Switches) -> None:
     assert in_force(*arguments) == expected
 
 

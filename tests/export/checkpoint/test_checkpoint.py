@@ -92,7 +92,7 @@ def test_without_an_action_expert_there_is_no_network(vlm: Path) -> None:
     assert "vlm: no action expert (60 tensors)" in refusal(vlm, fill_seed=None)
 
 
-def test_a_seed_fills_the_action_expert_and_says_untrained(vlm: Path) -> None:
+def test_a_seed_fills_the_action_expert_and_marks_it_untrained(vlm: Path) -> None:
     a = load_checkpoint([vlm], CONFIG, fill_seed=5)
     b = load_checkpoint([vlm], CONFIG, fill_seed=6)
     assert not a.info.trained
@@ -101,7 +101,7 @@ def test_a_seed_fills_the_action_expert_and_says_untrained(vlm: Path) -> None:
     assert weights_sha256(a.model) == weights_sha256(load_checkpoint([vlm], CONFIG, fill_seed=5).model)
 
 
-def test_a_value_network_may_be_absent_and_that_is_said(vlm: Path, model: TicVla, tmp_path: Path) -> None:
+def test_an_absent_value_network_is_reported(vlm: Path, model: TicVla, tmp_path: Path) -> None:
     path = tmp_path / "expert.safetensors"
     save_weights(model, path, WeightsInfo(trained=True, origin=""), parts=("action",))
     loaded = load_checkpoint([vlm, path], CONFIG, fill_seed=None)
@@ -175,9 +175,7 @@ def test_an_action_expert_of_another_configuration_is_refused(vlm: Path, tmp_pat
         (None, "downsample_ratio", 0.3),
     ],
 )
-def test_what_this_network_does_not_implement_is_refused_by_name(
-    vlm: Path, section: str | None, key: str, value: object
-) -> None:
+def test_unsupported_parts_are_refused_by_name(vlm: Path, section: str | None, key: str, value: object) -> None:
     config = original_config()
     (config[section] if section else config)[key] = value
     (vlm / "config.json").write_text(json.dumps(config), encoding="utf-8")
@@ -231,7 +229,7 @@ def test_nano_and_the_paper_size_have_a_tokenizer_and_other_ids_have_none() -> N
 # Our own files
 
 
-def test_what_was_saved_is_loaded(model: TicVla, tmp_path: Path) -> None:
+def test_saved_weights_are_loaded_unchanged(model: TicVla, tmp_path: Path) -> None:
     file = tmp_path / "small.safetensors"
     save_weights(model, file, WeightsInfo(trained=False, origin="random seed 0"))
     loaded = load_checkpoint([file], CONFIG, fill_seed=None)
@@ -241,7 +239,7 @@ def test_what_was_saved_is_loaded(model: TicVla, tmp_path: Path) -> None:
     assert loaded.info.origin.endswith(", random seed 0)")
 
 
-def test_a_safetensors_file_of_somebody_else_is_refused(tmp_path: Path) -> None:
+def test_a_foreign_safetensors_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "other.safetensors"
     save_file({"a": torch.zeros(1)}, str(path))
     assert "tensors of no layout that is known (a)" in refusal(path)

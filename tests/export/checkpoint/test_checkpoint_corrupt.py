@@ -156,7 +156,7 @@ def test_the_links_of_the_hub_cache_are_followed(vlm: Path, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("damage", ["absent shard", "moved tensor", "absent tensor", "tensor in two", "not json"])
-def test_an_index_that_does_not_tell_the_truth_is_refused(vlm: Path, original: dict[str, Tensor], damage: str) -> None:
+def test_a_wrong_index_is_refused(vlm: Path, original: dict[str, Tensor], damage: str) -> None:
     names = list(original)
     halves = {"a.safetensors": names[:20], "b.safetensors": names[20:]}
     weight_map = {name: file for file, inside in halves.items() for name in inside}
@@ -175,13 +175,13 @@ def test_an_index_that_does_not_tell_the_truth_is_refused(vlm: Path, original: d
     assert refusal(vlm)
 
 
-def test_an_empty_directory_says_what_is_expected(tmp_path: Path) -> None:
+def test_an_empty_directory_is_refused_with_the_expected_files(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     assert "has neither model.safetensors nor model.safetensors.index.json" in refusal(tmp_path / "empty")
 
 
 @pytest.mark.parametrize("name", ["absent.safetensors", "weights.onnx", "fifo.safetensors"])
-def test_what_is_no_checkpoint_is_refused(tmp_path: Path, name: str) -> None:
+def test_a_file_that_is_no_checkpoint_is_refused(tmp_path: Path, name: str) -> None:
     (tmp_path / "weights.onnx").write_bytes(b"x")
     os.mkfifo(tmp_path / "fifo.safetensors")
     assert refusal(tmp_path / name)

@@ -38,13 +38,13 @@ def test_a_network_with_other_numbers_has_none(folder: Path) -> None:
     assert shipped_weights(PRESETS["1b"], folder) is None
 
 
-def test_a_damaged_file_is_said(folder: Path) -> None:
+def test_a_damaged_file_is_reported(folder: Path) -> None:
     (folder / "nano.safetensors").write_bytes(b"\x00" * 20)
     with pytest.raises(CheckpointError, match="install the package again"):
         shipped_weights(SMALL, folder)
 
 
-def test_an_export_takes_them_unless_it_is_told_otherwise(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_export_takes_them_unless_a_seed_is_given(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("export.pipeline.job.shipped_weights", lambda config: shipped_weights(config, folder))
     shipped, random = WeightSource(SMALL, [], None).loaded, WeightSource(SMALL, [], 3).loaded
     assert shipped.info.trained and not random.info.trained

@@ -106,7 +106,7 @@ def test_a_damaged_set_is_refused_in_one_line(tmp_path: Path, change: Callable[[
     assert "\n" not in str(error.value)
 
 
-def test_a_folder_of_images_is_a_walk_that_is_assumed_and_says_so(tmp_path: Path) -> None:
+def test_a_folder_of_images_is_a_walk_with_assumed_motion(tmp_path: Path) -> None:
     loaded = load_calibration(f"folder:{_folder(tmp_path / 'mine')}")
     (clip,) = loaded.clips
     assert "0.5 m/s" in clip.assumed and "0.5 m/s" in str(loaded.to_dict()["assumed"])
@@ -144,7 +144,7 @@ def test_a_video_gives_one_picture_a_second(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["folder", "video"])
-def test_what_cannot_be_read_is_refused_in_one_line(tmp_path: Path, kind: str) -> None:
+def test_an_unreadable_source_is_refused_in_one_line(tmp_path: Path, kind: str) -> None:
     with pytest.raises(CalibrationError, match=r"cannot be read \(No such file"):
         load_calibration(f"{kind}:{tmp_path / 'nothing'}")
 

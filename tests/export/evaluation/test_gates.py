@@ -135,7 +135,7 @@ def test_every_task_threshold_fails_alone(change: dict[str, float], message: str
         (GOOD, replace(STEADY, token_agreement=0.3), "share of the same text 0.3 (≥ 0.5)"),
     ],
 )
-def test_between_two_thresholds_it_warns_and_says_why(parity: ParityResult, task: TaskResult, message: str) -> None:
+def test_between_two_thresholds_it_warns_with_the_reason(parity: ParityResult, task: TaskResult, message: str) -> None:
     assert judge(parity, task, GATE, TASK_GATE) == Verdict("WARN", (message,))
 
 
@@ -146,7 +146,7 @@ def test_another_token_from_untrained_weights_only_warns() -> None:
     assert judge(replace(unsure, cosine=0.5), STEADY, GATE, TASK_GATE, trained=False).level == "FAIL"
 
 
-def test_other_text_from_untrained_weights_says_nothing_but_their_plans_and_state_do() -> None:
+def test_text_of_untrained_weights_is_not_judged_but_their_plans_and_state_are() -> None:
     assert judge(GOOD, replace(STEADY, token_agreement=0.0), GATE, TASK_GATE, trained=False) == Verdict("PASS")
     for change in ({"relative": 1.5}, {"kv_cosine": 0.5}):
         assert judge(GOOD, replace(STEADY, **change), GATE, TASK_GATE, trained=False).level == "FAIL"

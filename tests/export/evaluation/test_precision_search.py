@@ -167,7 +167,7 @@ def test_the_vocabulary_matters_to_the_token_and_not_to_the_plan(reference: Refe
 
 
 @pytest.mark.slow
-def test_when_even_the_most_exact_candidate_is_outside_it_says_so(search: Search) -> None:
+def test_when_even_the_most_exact_candidate_is_outside_the_decision_reports_it(search: Search) -> None:
     decision = search.choose("language_model", ["int8-b32", "int4-b32"], within(1e-6))
     assert decision.precision == Precision("int8-b32") and not decision.within_limits
     assert "outside the limits" in decision.reason
@@ -222,7 +222,7 @@ def test_limits_must_be_positive(field: str) -> None:
 SIZES = {"fp32": 400, "fp16": 200, "int8-b128": 103, "int8-b32": 112}
 
 
-def test_a_variant_that_is_not_smaller_and_not_known_to_be_faster_is_dropped() -> None:
+def test_a_variant_that_is_neither_smaller_nor_measured_faster_is_dropped() -> None:
     kept, dropped = drop_dominated("g", list(SIZES), SIZES, ())
     assert kept == ("fp32", "fp16", "int8-b128")
     assert [item.precision for item in dropped] == ["int8-b32"]

@@ -121,7 +121,7 @@ STORED = {
         if form == "fused" or "_m" not in name
     ],
 )
-def test_every_combination_runs_as_the_network_and_stores_what_it_says_or_is_refused(
+def test_every_combination_runs_as_the_network_and_stores_its_precision_or_is_refused(
     small: TicVla, tmp_path: Path, name: str, form: str, precision: str, half: bool
 ) -> None:
     asked = Precision(precision, (("embed", "fp16"),) if "language" in name else ())

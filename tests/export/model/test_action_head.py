@@ -17,14 +17,7 @@ from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 from export.checkpoint.load import load_checkpoint
 from export.model.action import ActionExpert
 from export.model.config import PRESETS, ModelConfigError, config_from_dict
-from export.model.heads import (
-    ActionScale,
-    Diffusion,
-    cosine_schedule,
-    ddim_steps,
-    differentiated,
-    integrated,
-)
+from export.model.heads import ActionScale, Diffusion, cosine_schedule, ddim_steps, differentiated, integrated
 from export.model.network import build
 from export.model.weights import CheckpointError, WeightsInfo, save_weights, weights_sha256
 from tests.support.export.action_heads import HEADS, TINY, drives, expert, instants, lively, normal, states, with_head
@@ -46,7 +39,7 @@ def plan(action: ActionExpert, batch: int = 1, tokens: int = 6, mask: Tensor | N
 # The query head is what it was
 
 
-def test_a_configuration_reads_back_and_one_from_before_there_were_heads_is_the_query_heads() -> None:
+def test_a_configuration_reads_back_and_one_without_a_head_has_the_query_head() -> None:
     for head in HEADS:
         config = with_head(TINY, head, ddim_steps=7, couplings=3)
         assert config_from_dict(json.loads(json.dumps(config.to_dict()))) == config
@@ -221,7 +214,7 @@ def trained(head: str, inputs: tuple[Tensor, ...], kv: Tensor, target: Tensor) -
 
 @pytest.mark.slow
 @pytest.mark.parametrize("head", HEADS)
-def test_a_head_learns_what_to_do_where(head: str) -> None:
+def test_a_head_learns_the_action_of_each_state(head: str) -> None:
     inputs, kv = instants(2), states(2, 6)
     action = trained(head, inputs, kv, TWO_WAYS)
     with torch.no_grad():
@@ -231,7 +224,7 @@ def test_a_head_learns_what_to_do_where(head: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("head", ["diffusion", "flow"])
-def test_where_two_ways_are_as_good_one_is_taken_and_not_their_middle(head: str) -> None:
+def test_of_two_equal_trajectories_one_is_predicted_and_not_their_mean(head: str) -> None:
     inputs = tuple(x.expand(8, *x.shape[1:]) for x in instants(1))
     action = trained(head, inputs, states(1, 6), TWO_WAYS.repeat(4, 1, 1))
     noise = {"diffusion": action.diffusion, "flow": action.flow}[head].noise
@@ -263,7 +256,7 @@ def test_every_step_is_normalised_by_the_data_sets_own_steps() -> None:
     torch.testing.assert_close(normalised.std(dim=0, correction=0), torch.ones(11, 3), atol=1e-4, rtol=0)
 
 
-def test_steps_that_are_not_known_say_nothing_of_the_scale() -> None:
+def test_unknown_steps_do_not_change_the_scale() -> None:
     known = torch.arange(11)[None].expand(40, -1) < torch.arange(40)[:, None]
     known[:, 0] = known[39] = True
     wild = drives(40)
@@ -322,7 +315,7 @@ def test_ddim_with_the_best_denoiser_maps_noise_onto_the_data() -> None:
     torch.testing.assert_close(found, 0.4 + 0.5 * diffusion.noise, atol=0.02, rtol=0)
 
 
-def test_training_sees_every_noise_level_with_as_much_noise_as_it_says() -> None:
+def test_training_draws_every_noise_level_with_its_own_noise() -> None:
     diffusion = Diffusion(with_head(TINY, "diffusion", diffusion_steps=10).action)
     noisy, times = diffusion.corrupted(torch.full((4000, 11, 3), 2.0), seeded(0))
     shares = torch.tensor(cosine_schedule(10))

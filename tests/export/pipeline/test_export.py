@@ -73,7 +73,7 @@ def test_every_graph_passed_the_gate_on_eight_inputs_and_on_the_task(artifacts_d
 
 
 @pytest.mark.parametrize("name", GRAPHS)
-def test_the_manifest_says_what_a_graph_is_made_of_and_how_it_is_opened(artifacts_dir: Path, name: str) -> None:
+def test_the_manifest_lists_a_graphs_files_and_session_options(artifacts_dir: Path, name: str) -> None:
     graph = manifest(artifacts_dir)["graphs"][name]
     assert graph["bytes"] == (artifacts_dir / graph["file"]).stat().st_size
     assert graph["precision"] == {"default": "fp32", "overrides": {}}
@@ -177,9 +177,7 @@ def test_two_exports_of_the_same_weights_are_byte_identical_with_nothing_cached(
     assert [path.name for path in tmp_path.iterdir()] == ["cold"]
 
 
-def test_two_exports_are_byte_identical_with_everything_cached_whatever_happened_to_the_first(
-    artifacts_dir: Path, tmp_path: Path
-) -> None:
+def test_a_cached_export_is_byte_identical_even_if_the_first_was_changed(artifacts_dir: Path, tmp_path: Path) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
     assert main([*RANDOM, "--out", str(first)]) == 0
     data = bytearray((first / "action_expert.onnx").read_bytes())

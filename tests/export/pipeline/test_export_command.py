@@ -21,12 +21,8 @@ LOOSE = [
 @pytest.mark.parametrize(
     ("arguments", "kept"), [([], "finished stages are in the cache"), (["--no-cache"], "nothing was kept")]
 )
-def test_an_interrupt_says_what_is_left(
-    arguments: list[str],
-    kept: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+def test_an_interrupt_names_the_remaining_parts(
+    arguments: list[str], kept: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -12,30 +10,10 @@ from typing import Any
 import onnx
 import pytest
 
-from edge.artifacts.files import seal
 from export.cli import main
+from tests.support.artifact_directory import edit_manifest, flip_bit, replace_file
 
 Damage = Callable[[Path], None]
-
-
-def edit(directory: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    path = directory / "manifest.json"
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(seal(content)))
-
-
-def replace(directory: Path, name: str, data: bytes) -> None:
-    """Another file under the same name, with a manifest that vouches for it."""
-    (directory / name).write_bytes(data)
-    entry = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
-    edit(directory, lambda m: m["files"].update({name: entry}))
-
-
-def flip(directory: Path, name: str) -> None:
-    data = bytearray((directory / name).read_bytes())
-    data[len(data) // 2] ^= 1
-    (directory / name).write_bytes(data)
 
 
 def cut(directory: Path, name: str) -> None:
@@ -48,7 +26,7 @@ def reshape(directory: Path) -> None:
     proto = onnx.load(str(directory / "action_expert.onnx"))
     state = next(tensor for tensor in proto.graph.input if tensor.name == "state")
     state.type.tensor_type.shape.dim[1].dim_value = 4
-    replace(directory, "action_expert.onnx", proto.SerializeToString())
+    replace_file(directory, "action_expert.onnx", proto.SerializeToString())
 
 
 def link_out(directory: Path) -> None:
@@ -62,12 +40,12 @@ def lengthen(directory: Path) -> None:
         shape = next(t for t in manifest["graphs"]["action_expert"]["outputs"] if t["name"] == "trajectory")["shape"]
         shape[2] = 4
 
-    edit(directory, change)
+    edit_manifest(directory, change)
 
 
 DAMAGED: dict[str, tuple[Damage, str]] = {
-    "a flipped bit in a graph": (lambda d: flip(d, "language_model.onnx"), "language_model.onnx: sha256"),
-    "a flipped bit in the report": (lambda d: flip(d, "report.html"), "report.html: sha256"),
+    "a flipped bit in a graph": (lambda d: flip_bit(d, "language_model.onnx"), "language_model.onnx: sha256"),
+    "a flipped bit in the report": (lambda d: flip_bit(d, "report.html"), "report.html: sha256"),
     "a truncated graph": (lambda d: cut(d, "vision_encoder.onnx"), "vision_encoder.onnx: "),
     "a truncated manifest": (lambda d: cut(d, "manifest.json"), "manifest.json: not JSON"),
     "no manifest": (lambda d: (d / "manifest.json").unlink(), "manifest.json: cannot be read"),
@@ -75,45 +53,45 @@ DAMAGED: dict[str, tuple[Damage, str]] = {
     "a planted pickle": (lambda d: (d / "weights.pkl").write_bytes(b"\x80\x04."), "weights.pkl: not listed"),
     "a link that leads out": (link_out, "tokenizer.json: missing or not a regular file"),
     "a listed path that leads out": (
-        lambda d: edit(d, lambda m: m["files"].update({"../evil": {"bytes": 1, "sha256": "0" * 64}})),
+        lambda d: edit_manifest(d, lambda m: m["files"].update({"../evil": {"bytes": 1, "sha256": "0" * 64}})),
         "'../evil' is not a plain name",
     ),
     "a data file that leads out": (
-        lambda d: edit(d, lambda m: m["graphs"]["vision_encoder"].update(data_files=["../../etc/passwd"])),
+        lambda d: edit_manifest(d, lambda m: m["graphs"]["vision_encoder"].update(data_files=["../../etc/passwd"])),
         "'../../etc/passwd' is not among the files",
     ),
-    "another schema": (lambda d: edit(d, lambda m: m.update(schema_version=1)), "schema version 1"),
+    "another schema": (lambda d: edit_manifest(d, lambda m: m.update(schema_version=1)), "schema version 1"),
     "a graph of another shape": (reshape, "action_expert.onnx: ONNX Runtime cannot open it"),
     "a contract of another shape": (lengthen, "trajectory is"),
-    "a pickle in a graph's place": (lambda d: replace(d, "vision_encoder.onnx", b"\x80\x04."), "is a pickle"),
-    "a file that is no graph": (lambda d: replace(d, "vision_encoder.onnx", b"not a graph"), "not an ONNX model"),
+    "a pickle in a graph's place": (lambda d: replace_file(d, "vision_encoder.onnx", b"\x80\x04."), "is a pickle"),
+    "a file that is no graph": (lambda d: replace_file(d, "vision_encoder.onnx", b"not a graph"), "not an ONNX model"),
     "a graph that is another": (
-        lambda d: replace(d, "action_expert.onnx", (d / "semantic_context.onnx").read_bytes()),
+        lambda d: replace_file(d, "action_expert.onnx", (d / "semantic_context.onnx").read_bytes()),
         "not those of the manifest",
     ),
     "a renamed output": (
-        lambda d: edit(d, lambda m: m["graphs"]["language_model"]["outputs"][2].update(name="confidence")),
+        lambda d: edit_manifest(d, lambda m: m["graphs"]["language_model"]["outputs"][2].update(name="confidence")),
         "not those of the manifest",
     ),
-    "no provenance": (lambda d: edit(d, lambda m: m.update(provenance={})), "provenance cannot be read"),
+    "no provenance": (lambda d: edit_manifest(d, lambda m: m.update(provenance={})), "provenance cannot be read"),
     "a target that is none": (
-        lambda d: edit(d, lambda m: m["provenance"]["target"].update(turbo=True)),
+        lambda d: edit_manifest(d, lambda m: m["provenance"]["target"].update(turbo=True)),
         "provenance cannot be read (provenance.target: unknown key 'turbo'",
     ),
     "a network that is none": (
-        lambda d: edit(d, lambda m: m["model"]["config"]["action"].update(layers=-1)),
+        lambda d: edit_manifest(d, lambda m: m["model"]["config"]["action"].update(layers=-1)),
         "provenance cannot be read",
     ),
     "a calibration set that is another": (
-        lambda d: edit(d, lambda m: m["provenance"]["calibration"].update(sha256="0" * 64)),
+        lambda d: edit_manifest(d, lambda m: m["provenance"]["calibration"].update(sha256="0" * 64)),
         "calibration set corridor-go2 has sha256 000000000000…",
     ),
     "weights that are others": (
-        lambda d: edit(d, lambda m: m["provenance"].update(weights_sha256="0" * 64)),
+        lambda d: edit_manifest(d, lambda m: m["provenance"].update(weights_sha256="0" * 64)),
         "built from other weights",
     ),
     "a session of nowhere": (
-        lambda d: edit(d, lambda m: m["graphs"]["vision_encoder"].update(session={"provider": "x"})),
+        lambda d: edit_manifest(d, lambda m: m["graphs"]["vision_encoder"].update(session={"provider": "x"})),
         "session must give",
     ),
 }

@@ -44,9 +44,7 @@ def test_a_failed_swap_puts_the_old_directory_back(
     load_artifacts(out)
 
 
-def test_an_existing_directory_that_is_not_ours_is_not_touched(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_foreign_directory_is_not_touched(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter1.tex").write_text("years of work")
     assert main(["--out", str(tmp_path / "thesis")]) == 2
@@ -75,7 +73,7 @@ def test_a_link_to_a_directory_stays_a_link(artifacts_dir: Path, tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_an_older_directory_of_ours_is_replaced_if_its_files_are_as_it_says(
+def test_an_older_directory_of_ours_is_replaced_if_its_files_match_its_manifest(
     artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))
@@ -101,7 +99,7 @@ def test_a_second_export_into_one_directory_is_refused(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_a_killed_export_was_replacing_comes_back(artifacts_dir: Path, tmp_path: Path) -> None:
+def test_the_directory_that_a_killed_export_replaced_is_restored(artifacts_dir: Path, tmp_path: Path) -> None:
     work = tmp_path / ".nano.edge-export"
     shutil.copytree(artifacts_dir, work / "old")
     (work / "new").mkdir()

@@ -71,7 +71,7 @@ def test_another_tokenizer_does_not_verify_although_the_manifest_vouches_for_it(
 
 
 @pytest.mark.slow
-def test_thresholds_that_were_set_are_kept_and_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_changed_thresholds_are_kept_and_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     setting = "gates.action_expert.max_abs=0.5"
     assert main(["--out", str(tmp_path / "nano"), "--set", setting]) == 0
     assert main(["verify", str(tmp_path / "nano")]) == 0
@@ -79,7 +79,7 @@ def test_thresholds_that_were_set_are_kept_and_said(tmp_path: Path, capsys: pyte
 
 
 @pytest.mark.slow
-def test_a_directory_for_a_target_of_the_users_own_says_whose_thresholds_it_is_held_to(
+def test_a_directory_for_a_users_target_names_the_origin_of_its_thresholds(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     own = tmp_path / "own.toml"

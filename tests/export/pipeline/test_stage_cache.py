@@ -145,7 +145,7 @@ def flip(path: Path) -> None:
     ],
     ids=["flipped", "truncated", "missing", "planted", "no record", "another record", "half a record"],
 )
-def test_a_damaged_entry_is_built_again_and_said_so(
+def test_a_damaged_entry_is_rebuilt_and_reported(
     cache: StageCache, notes: Notes, damage: Callable[[Path], object]
 ) -> None:
     entry, _ = cache.fetch_or_build("k", writes("good"))
@@ -236,7 +236,7 @@ def test_a_directory_with_files_of_the_users_is_refused_and_not_touched(
 
 
 @pytest.mark.parametrize("name", ["photos/a.jpg", "movie.partial", "thesis.building", f"{'a' * 63}/x", "AB/x"])
-def test_what_a_user_puts_into_a_cache_stays_whatever_it_is_cut_to(tmp_path: Path, notes: Notes, name: str) -> None:
+def test_a_users_file_in_a_cache_survives_any_pruning(tmp_path: Path, notes: Notes, name: str) -> None:
     with open_cache(tmp_path, GIB, notes) as cache:
         cache.fetch_or_build(key("k"), writes("x"))
     theirs = tmp_path / name

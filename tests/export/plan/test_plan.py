@@ -18,7 +18,6 @@ from export.targets.file import Target, load_target, with_settings
 from export.targets.sections import MEASURED, MODELLED, Measured
 
 BIG, NANO = PRESETS["1b"], PRESETS["nano"]
-PAPER_MS = {"orin": (120.27, 4831.73), "rtx4060": (85.73, 3430.73)}
 FP32 = Precision("fp32")
 
 
@@ -45,7 +44,7 @@ def test_the_paper_size_model_fits_the_two_boards_by_the_model(name: str) -> Non
 
 
 @pytest.mark.slow
-def test_the_stock_25_watt_mode_is_refused_with_what_exceeds_by_how_much_and_what_to_change() -> None:
+def test_the_stock_25_watt_mode_is_refused_with_the_excess_and_advice() -> None:
     made = planned("orin", "power.mode=25W")
     assert not made.fits
     with pytest.raises(PlanError) as refusal:
@@ -65,7 +64,7 @@ def test_the_stock_25_watt_mode_is_refused_with_what_exceeds_by_how_much_and_wha
         ("rtx4060", "device.memory_gib=4", "exceeds the 3.00 GiB"),
     ],
 )
-def test_a_plan_that_exceeds_power_age_or_memory_says_which(name: str, setting: str, reason: str) -> None:
+def test_a_plan_that_exceeds_power_age_or_memory_names_the_limit(name: str, setting: str, reason: str) -> None:
     made = planned(name, setting)
     assert not made.fits and any(reason in line for line in made.reasons)
 
@@ -94,7 +93,7 @@ def test_a_tick_waits_at_most_for_the_call_in_flight_where_both_threads_share_a_
     assert made.tick.ms == pytest.approx(made.tick_alone.ms + longest, abs=1e-3)
 
 
-def test_a_development_machine_says_what_it_cannot_do_in_time_and_is_not_made_to_stop() -> None:
+def test_a_development_machine_reports_its_late_stages_and_is_not_refused() -> None:
     made = planned("cpu")
     assert not made.fits
     assert not target("cpu").runtime.enforce_plan
@@ -127,7 +126,7 @@ def with_point(base: Target, **changes: object) -> Target:
     return dataclasses.replace(base, measured=(point,))
 
 
-def test_a_measured_point_replaces_the_model_and_says_where_it_was_taken() -> None:
+def test_a_measured_point_replaces_the_model_and_names_its_device() -> None:
     entry = stage(plan(with_point(target("orin")), BIG), "vision_encoder")
     assert (entry["ms"], entry["tagged"], entry["bound"]) == (61.5, MEASURED, MEASURED)
     assert "the board in the laboratory, 2026-11-21" in entry["source"]
@@ -204,25 +203,6 @@ def test_the_model_of_a_cpu_comes_near_what_was_measured_there(
     assert entry["tagged"] == MODELLED
     each = entry["ms"] / (32 if stage_name == "decode" else 1)
     assert each == pytest.approx(measured_ms, rel=tolerance)
-
-
-def test_against_the_paper_the_tick_without_reasoning_is_shorter_by_a_third_and_a_ninth() -> None:
-    """Modelled for TensorRT fp16 at our power modes, over the paper's PyTorch at modes it does not give:
-    control 0.65 on Orin NX and 0.89 on the RTX 4060."""
-    ratios = {name: planned(name).tick_alone.ms / PAPER_MS[name][0] for name in PAPER_MS}
-    assert ratios == {"orin": pytest.approx(0.65, abs=0.01), "rtx4060": pytest.approx(0.89, abs=0.01)}
-
-
-@pytest.mark.slow
-def test_against_the_paper_a_generation_alone_is_far_shorter() -> None:
-    """0.12 of the paper's reasoning time on Orin NX, 0.085 on the RTX 4060, with 1,134 tokens read and 48 new: the
-    paper does not say how many it generates, and an eager PyTorch decoder is bound by launches, which a roofline
-    does not see. Under the power budget and beside control it is 0.54 and 0.37: too good to be believed before it is
-    measured."""
-    alone = {name: planned(name, text_tokens=110).generation_alone.ms / PAPER_MS[name][1] for name in PAPER_MS}
-    assert alone == {"orin": pytest.approx(0.12, abs=0.005), "rtx4060": pytest.approx(0.085, abs=0.005)}
-    beside = {name: planned(name, text_tokens=110).generation.ms / PAPER_MS[name][1] for name in PAPER_MS}
-    assert beside == {"orin": pytest.approx(0.54, abs=0.01), "rtx4060": pytest.approx(0.37, abs=0.01)}
 
 
 @pytest.mark.parametrize(

@@ -104,7 +104,7 @@ def test_a_step_takes_a_few_samples_of_a_topic_and_the_next_ones_the_rest(
 
 
 @pytest.mark.parametrize("stick", [math.nan, 1.6, -1e30, math.inf])
-def test_the_stop_keys_count_whatever_the_sticks_say(bus: Bus, link: RobotLink, stick: float) -> None:
+def test_the_stop_keys_count_with_any_stick_position(bus: Bus, link: RobotLink, stick: float) -> None:
     bus.writer(ids.REMOTE_TOPIC, WirelessController_).write(WirelessController_(0.0, stick, 0.0, 0.0, L2_B))
     assert read_until(link, lambda report: report.remote_estop).remote_estop
     assert link.dropped()[0] == 1
@@ -122,7 +122,7 @@ def test_the_battery_is_read_in_every_step_until_it_has_reported(
     assert topics.count(ids.LF_LOW_STATE_TOPIC) == 3
 
 
-def test_what_is_larger_than_all_that_is_kept_is_dropped_by_dds_itself(dds_domain: int) -> None:
+def test_a_message_larger_than_the_reader_limit_is_dropped_by_dds(dds_domain: int) -> None:
     """Seen at a writer of the same process; the rule is one of the whole participant."""
     bus = Bus(DdsConfig(dds_domain, "lo", ("127.0.0.1",)), max_sample_bytes=1_000_000)
     writer = bus.writer(ids.response_topic(ids.SPORT_SERVICE), Response_)

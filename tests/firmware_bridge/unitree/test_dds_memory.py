@@ -31,7 +31,7 @@ for line in sys.stdin:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_memory_stands_still_while_others_come_and_go(dds_domain: int) -> None:
+def test_memory_stays_constant_while_other_participants_come_and_go(dds_domain: int) -> None:
     bus = Bus(DdsConfig(dds_domain, "lo", ("127.0.0.1",)))
     command = [sys.executable, "-c", _LISTENER, str(dds_domain)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as listener:

@@ -68,7 +68,7 @@ def test_a_report_with_an_impossible_field_is_dropped(change: dict[str, object])
 
 
 @given(st.lists(wild, min_size=3, max_size=3), st.lists(wild, min_size=3, max_size=3), wild, wild)
-def test_whatever_is_reported_what_comes_out_is_finite_and_bounded(
+def test_every_output_is_finite_and_bounded(
     position: list[float], velocity: list[float], yaw_speed: float, roll: float
 ) -> None:
     report = sample(position=position, velocity=velocity, yaw_speed=yaw_speed, rpy=[roll, 0.0, 0.0])

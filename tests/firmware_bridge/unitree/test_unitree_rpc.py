@@ -94,7 +94,7 @@ def test_a_call_returns_the_services_answer_or_raises_with_its_error_code(bus: B
     assert error.value.code == 4202
 
 
-def test_no_service_is_said_in_time(bus: Bus) -> None:
+def test_a_missing_service_is_reported_in_time(bus: Bus) -> None:
     with pytest.raises(RpcError, match=r"no such service on the bus within 0\.1 s") as error:
         RpcClient(bus, "telepathy").call(1001, timeout_s=0.1)
     assert error.value.code is None
@@ -196,7 +196,7 @@ def test_a_state_that_overtook_an_older_one_is_not_followed_by_it(bus: Bus, read
     assert reader.state().robot_stamp_ns == 2_000_000_000  # type: ignore[union-attr]
 
 
-def test_the_battery_is_looked_at_twice_a_second(bus: Bus, reader: Go2Reader) -> None:
+def test_the_battery_is_read_twice_a_second(bus: Bus, reader: Go2Reader) -> None:
     assert reader.battery() is None
     writer, message = bus.writer(ids.LF_LOW_STATE_TOPIC, LowState_), LowStateMessage().message
     message.bms_state.soc, message.power_v, message.power_a = 42, 29.5, 3.5

@@ -9,6 +9,8 @@ import stat
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from itertools import pairwise
 from pathlib import Path
 
@@ -45,16 +47,29 @@ def wait_for_request(robot: FakeGo2, api_id: int) -> int:
     return next(command.received_ns for command in list(robot.received) if command.api_id == api_id)
 
 
-def driver(socket_path: Path, folder: Path):
+Drive = Callable[[], AbstractContextManager[Running]]
+
+
+def driver(socket_path: Path, folder: Path) -> AbstractContextManager[Running]:
     return running("tests.support.robot.bridge_driver", socket_path, 0.5, folder=folder)
 
 
+@pytest.fixture
+def drive(robot: FakeGo2, bridge: Running, socket_path: Path, tmp_path: Path) -> Drive:
+    """Start a runner at the bridge and enter the block once the robot is driven."""
+
+    @contextmanager
+    def start() -> Iterator[Running]:
+        with driver(socket_path, tmp_path) as runner:
+            wait_for(robot.is_driven, 20, "the robot is driven")
+            yield runner
+
+    return start
+
+
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-def test_a_dead_or_frozen_runner_leaves_zero_on_the_wire(
-    robot: FakeGo2, bridge: Running, socket_path: Path, tmp_path: Path, number: signal.Signals
-) -> None:
-    with HostStall() as host, driver(socket_path, tmp_path) as runner:
-        wait_for(robot.is_driven, 20, "the robot is driven")
+def test_a_dead_or_frozen_runner_leaves_zero_on_the_wire(robot: FakeGo2, drive: Drive, number: signal.Signals) -> None:
+    with HostStall() as host, drive() as runner:
         time.sleep(0.25)
         since_ns = time.monotonic_ns()
         os.kill(runner.pid, number)
@@ -64,24 +79,24 @@ def test_a_dead_or_frozen_runner_leaves_zero_on_the_wire(
 
 
 @pytest.mark.slow
-def test_a_frozen_runner_that_thaws_does_not_drive_again(
-    robot: FakeGo2, bridge: Running, socket_path: Path, tmp_path: Path
+@pytest.mark.parametrize("frozen", ["runner", "bridge"])
+def test_a_process_that_was_frozen_does_not_drive_on(
+    robot: FakeGo2, bridge: Running, drive: Drive, frozen: str
 ) -> None:
-    with driver(socket_path, tmp_path) as runner:
-        wait_for(robot.is_driven, 20, "the robot is driven")
-        os.kill(runner.pid, signal.SIGSTOP)
-        time.sleep(0.5)
+    with drive() as runner:
+        pid = runner.pid if frozen == "runner" else bridge.pid
+        os.kill(pid, signal.SIGSTOP)
+        time.sleep(0.6)
         robot.received.clear()
-        os.kill(runner.pid, signal.SIGCONT)
+        os.kill(pid, signal.SIGCONT)
         time.sleep(0.5)
         assert robot.moves() and all(command.velocity == ZERO for command in robot.moves())
 
 
 def test_ending_the_bridge_while_driving_leaves_zero_and_a_stop_move(
-    robot: FakeGo2, bridge: Running, socket_path: Path, tmp_path: Path
+    robot: FakeGo2, bridge: Running, drive: Drive, socket_path: Path, tmp_path: Path
 ) -> None:
-    with driver(socket_path, tmp_path):
-        wait_for(robot.is_driven, 20, "the robot is driven")
+    with drive():
         robot.received.clear()
         assert bridge.end() == 0
     wait_for(lambda: robot.moves() and robot.moves()[-1].velocity == ZERO, 20, "zero as the last command")
@@ -91,11 +106,8 @@ def test_ending_the_bridge_while_driving_leaves_zero_and_a_stop_move(
     assert not socket_path.exists()
 
 
-def test_a_robot_that_falls_silent_is_stopped(
-    robot: FakeGo2, bridge: Running, socket_path: Path, tmp_path: Path
-) -> None:
-    with driver(socket_path, tmp_path):
-        wait_for(robot.is_driven, 20, "the robot is driven")
+def test_a_robot_that_falls_silent_is_stopped(robot: FakeGo2, bridge: Running, drive: Drive) -> None:
+    with drive():
         robot.reporting = False
         try:
             wait_for(lambda: not robot.is_driven(), 20, "zero velocity")
@@ -117,10 +129,9 @@ def test_nothing_is_sent_before_arm(robot: FakeGo2, bridge: Running, socket_path
 
 @pytest.mark.slow
 def test_a_second_client_is_turned_away_and_the_first_drives_on(
-    robot: FakeGo2, bridge: Running, socket_path: Path, tmp_path: Path
+    robot: FakeGo2, drive: Drive, socket_path: Path
 ) -> None:
-    with driver(socket_path, tmp_path):
-        wait_for(robot.is_driven, 20, "the robot is driven")
+    with drive():
         with pytest.raises(BridgeUnavailable, match="another client"):
             BridgeClient(socket_path)
         time.sleep(0.3)
@@ -128,12 +139,9 @@ def test_a_second_client_is_turned_away_and_the_first_drives_on(
 
 
 @pytest.mark.slow
-def test_a_new_client_may_arm_again_after_the_first_has_died(
-    robot: FakeGo2, bridge: Running, socket_path: Path, tmp_path: Path
-) -> None:
+def test_a_new_client_may_arm_again_after_the_first_has_died(robot: FakeGo2, drive: Drive) -> None:
     for _ in range(2):
-        with driver(socket_path, tmp_path) as runner:
-            wait_for(robot.is_driven, 20, "the robot is driven")
+        with drive() as runner:
             runner.process.kill()
         wait_for(lambda: not robot.is_driven(), 20, "zero velocity")
 
@@ -147,10 +155,7 @@ def test_a_second_bridge_on_the_socket_is_refused_and_a_file_is_left_alone(
     bridge: Running, dds_domain: int, socket_path: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "file").write_text("precious")
-    for path, code, message in (
-        (socket_path, 3, "another bridge listens"),
-        (tmp_path / "file", 2, "found a file"),
-    ):
+    for path, code, message in ((socket_path, 3, "another bridge listens"), (tmp_path / "file", 2, "found a file")):
         command = [sys.executable, "-m", "firmware_bridge.bridge", "--robot", str(GO2_SIM), "--socket", str(path)]
         command += ["--domain", str(dds_domain)]
         done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=20, check=False)
@@ -171,11 +176,10 @@ def test_a_socket_file_left_behind_is_replaced(
 
 
 def test_a_second_commander_gets_the_robot_zeroed_and_the_bridge_latched(
-    robot: FakeGo2, bridge: Running, socket_path: Path, tmp_path: Path
+    robot: FakeGo2, bridge: Running, drive: Drive
 ) -> None:
     rogue = RpcClient(robot.bus, ids.SPORT_SERVICE)
-    with HostStall() as host, driver(socket_path, tmp_path):
-        wait_for(robot.is_driven, 20, "the robot is driven")
+    with HostStall() as host, drive():
         wait_for(rogue.connected, 5, "the rogue to find the robot")
         since_ns = time.monotonic_ns()
         rogue.send(ids.MOVE, move_parameter(0.7, 0.0, 0.0), noreply=True)
@@ -184,11 +188,8 @@ def test_a_second_commander_gets_the_robot_zeroed_and_the_bridge_latched(
 
 
 @pytest.mark.slow
-def test_somebody_who_only_asks_is_no_commander(
-    robot: FakeGo2, bridge: Running, socket_path: Path, tmp_path: Path
-) -> None:
-    with driver(socket_path, tmp_path):
-        wait_for(robot.is_driven, 20, "the robot is driven")
+def test_a_client_that_only_reads_is_no_commander(robot: FakeGo2, drive: Drive) -> None:
+    with drive():
         RpcClient(robot.bus, ids.SPORT_SERVICE).call(ids.API_VERSION, timeout_s=5)
         time.sleep(0.3)
         assert robot.is_driven()
@@ -203,10 +204,9 @@ def test_somebody_who_only_asks_is_no_commander(
     ids=["stick", "L2 and B"],
 )
 def test_a_hand_on_the_remote_is_zero_within_60_ms(
-    robot: FakeGo2, bridge: Running, socket_path: Path, tmp_path: Path, remote: tuple, said: str
+    robot: FakeGo2, bridge: Running, drive: Drive, remote: tuple, said: str
 ) -> None:
-    with HostStall() as host, driver(socket_path, tmp_path):
-        wait_for(robot.is_driven, 20, "the robot is driven")
+    with HostStall() as host, drive():
         since_ns = time.monotonic_ns() + 20_000_000  # the fake robot reports every 20 ms
         robot.remote = remote
         check_lasting_zero(robot, since_ns, 60_000_000, host)
@@ -237,12 +237,9 @@ def test_a_late_move_is_answered_within_40_ms_and_motion_after_a_stop_by_another
 
 
 @pytest.mark.slow
-def test_a_stop_move_that_is_never_answered_holds_nothing_up(
-    robot: FakeGo2, bridge: Running, socket_path: Path, tmp_path: Path
-) -> None:
+def test_a_stop_move_that_is_never_answered_holds_nothing_up(robot: FakeGo2, drive: Drive) -> None:
     robot.unanswered = {ids.STOP_MOVE}
-    with HostStall() as host, driver(socket_path, tmp_path) as runner:
-        wait_for(robot.is_driven, 20, "the robot is driven")
+    with HostStall() as host, drive() as runner:
         since_ns = time.monotonic_ns()
         runner.process.kill()
         check_lasting_zero(robot, since_ns, STOP_BOUND_NS, host)
@@ -256,11 +253,10 @@ def test_a_stop_move_that_is_never_answered_holds_nothing_up(
 
 
 def test_a_killed_bridges_successor_stops_the_moving_robot_first(
-    robot: FakeGo2, bridge: Running, dds_domain: int, socket_path: Path, tmp_path: Path
+    robot: FakeGo2, bridge: Running, drive: Drive, dds_domain: int, socket_path: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "again").mkdir()
-    with driver(socket_path, tmp_path):
-        wait_for(robot.is_driven, 20, "the robot is driven")
+    with drive():
         robot.truth, robot.mode = {"velocity_world_mps": np.array((0.5, 0.0, 0.0))}, ids.MODE_LOCOMOTION
         bridge.process.kill()
         bridge.process.wait()
@@ -270,20 +266,6 @@ def test_a_killed_bridges_successor_stops_the_moving_robot_first(
         wait_for_request(robot, ids.STOP_MOVE)
         assert robot.received[0].velocity == ZERO
         wait_for(lambda: "the robot was moving" in successor.stderr(), 5, "the reason")
-
-
-@pytest.mark.slow
-def test_a_bridge_that_was_frozen_does_not_drive_on(
-    robot: FakeGo2, bridge: Running, socket_path: Path, tmp_path: Path
-) -> None:
-    with driver(socket_path, tmp_path):
-        wait_for(robot.is_driven, 20, "the robot is driven")
-        os.kill(bridge.pid, signal.SIGSTOP)
-        time.sleep(0.6)
-        robot.received.clear()
-        os.kill(bridge.pid, signal.SIGCONT)
-        time.sleep(0.5)
-        assert robot.moves() and all(command.velocity == ZERO for command in robot.moves())
 
 
 def test_another_robot_than_the_files_is_not_armed(robot: FakeGo2, bridge: Running, socket_path: Path) -> None:
@@ -318,7 +300,7 @@ def test_an_operator_stops_a_driven_robot_and_only_an_operator_takes_it_back(
 
 
 @pytest.mark.slow
-def test_where_the_robot_file_says_so_an_operator_permits_every_single_arming(
+def test_where_the_robot_file_requires_it_an_operator_permits_every_single_arming(
     robot: FakeGo2, dds_domain: int, socket_path: Path, tmp_path: Path
 ) -> None:
     file = tmp_path / "robot.toml"
@@ -328,20 +310,20 @@ def test_where_the_robot_file_says_so_an_operator_permits_every_single_arming(
     with running("firmware_bridge.bridge", *arguments, folder=tmp_path):
         client = BridgeClient(socket_path)
 
-        def told(state: str, cause: str) -> bool:
+        def has_status(state: str, cause: str) -> bool:
             status = client.poll()
             return status is not None and (status.state, status.cause) == (state, cause)
 
         client.arm()
-        wait_for(lambda: told("disarmed", "operator"), 10, "the refusal")
+        wait_for(lambda: has_status("disarmed", "operator"), 10, "the refusal")
         assert robot.received == []
         assert operate("arm", socket_path)[0] == 0
         client.arm()
-        wait_for(lambda: told("armed", "none"), 20, "armed")
+        wait_for(lambda: has_status("armed", "none"), 20, "armed")
         client.stop()
-        wait_for(lambda: told("stopped", "client_stop"), 10, "stopped")
+        wait_for(lambda: has_status("stopped", "client_stop"), 10, "stopped")
         client.arm()
-        wait_for(lambda: told("stopped", "operator"), 10, "the second refusal")
+        wait_for(lambda: has_status("stopped", "operator"), 10, "the second refusal")
         client.close()
 
 
@@ -359,7 +341,7 @@ def test_an_idle_operator_connection_is_not_in_the_way_of_a_stop(bridge: Running
     idle.close()
 
 
-def test_systemd_hears_ready_the_state_the_watchdog_and_the_end(
+def test_systemd_receives_ready_the_state_the_watchdog_and_the_end(
     robot: FakeGo2, dds_domain: int, socket_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     arguments = ("--robot", GO2_SIM, "--domain", dds_domain, "--socket", socket_path)

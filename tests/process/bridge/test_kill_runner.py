@@ -15,15 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.processes import (
-    GO2_SIM,
-    HostStall,
-    check_stop_latency,
-    hil_arguments,
-    read_trace,
-    running,
-    wait_for,
-)
+from tests.support.processes import GO2_SIM, HostStall, check_stop_latency, hil_arguments, read_trace, running, wait_for
 from tools.bench.stop import received_moves
 
 pytestmark = pytest.mark.process
@@ -86,7 +78,7 @@ def walk_then(rig: Rig, number: signal.Signals) -> tuple[int, int]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM])
-def test_the_robot_is_told_zero_within_300_ms(rig: Rig, number: signal.Signals) -> None:
+def test_the_robot_receives_zero_within_300_ms(rig: Rig, number: signal.Signals) -> None:
     with HostStall() as host:
         since_ns, latency_ns = walk_then(rig, number)
     check_stop_latency(latency_ns, BOUND_NS, since_ns, host)

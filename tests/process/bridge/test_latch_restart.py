@@ -69,7 +69,7 @@ def test_a_killed_bridges_successor_drives_no_runner_until_an_operator_arms(rig:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("content", [b"", b"\xff\x00garbage", None], ids=["empty", "garbage", "a folder"])
-def test_a_latch_file_that_says_nothing_readable_is_a_latch(rig: Rig, content: bytes | None) -> None:
+def test_an_unreadable_latch_file_is_a_latch(rig: Rig, content: bytes | None) -> None:
     if content is None:
         rig.latch.mkdir()
     else:
@@ -79,7 +79,7 @@ def test_a_latch_file_that_says_nothing_readable_is_a_latch(rig: Rig, content: b
 
 
 @pytest.mark.slow
-def test_a_latch_file_that_cannot_be_written_delays_nothing_and_is_told_in_one_line(rig: Rig) -> None:
+def test_a_latch_file_that_cannot_be_written_delays_nothing_and_is_reported_in_one_line(rig: Rig) -> None:
     folder = rig.folder / "removed later"
     folder.mkdir()
     with rig.bridge("bridge", "--latch", folder / "latch") as bridge, HostStall() as host:

@@ -110,9 +110,9 @@ class TestConfirmation:
         def once(number: int) -> dict[str, float]:
             with rig.driving():
                 since_ns = time.monotonic_ns()
-                code, values, said = rig.operate("stop")
+                code, values, message = rig.operate("stop")
                 confirmed_ns = time.monotonic_ns()
-                assert code == 0, said
+                assert code == 0, message
                 assert rig.robot.speed_mps < REST_MPS and values["motion"] == "still"
                 rest_ms, distance_m = rig.rest_after(since_ns)
             confirmed_ms = (confirmed_ns - since_ns) / 1e6
@@ -133,18 +133,18 @@ class TestConfirmation:
             with rig.driving():
                 rig.robot.take_lease(0.8)
                 since_ns = time.monotonic_ns()
-                code, values, said = rig.operate("stop")
+                code, values, message = rig.operate("stop")
                 told_ms = (rig.first_line_ns - since_ns) / 1e6
                 allow(800, since_ns, told_ms, host)
-                assert said.startswith("edge-bridge: stop sent; the robot still moves")
-                assert code == 1 and "STILL MOVES" in said, said
-                assert "press L2 and B" in said and values["motion"] == "moving"
+                assert message.startswith("edge-bridge: stop sent; the robot still moves")
+                assert code == 1 and "STILL MOVES" in message, message
+                assert "press L2 and B" in message and values["motion"] == "moving"
                 assert rig.robot.speed_mps > 0.7
                 rig.robot.give_lease_back()
-            code, values, said = rig.operate("stop")
+            code, values, message = rig.operate("stop")
             while code != 0:
                 assert rig.robot.speed_mps >= REST_MPS or values["motion"] != "still"
-                code, values, said = rig.operate("stop")
+                code, values, message = rig.operate("stop")
             assert rig.robot.speed_mps < REST_MPS
             return {"stop to `the robot still moves`, ms": told_ms}
 
@@ -183,8 +183,8 @@ class TestPermission:
 
         def once(number: int) -> dict[str, float]:
             time.sleep(0.05)
-            code, _, said = rig.operate("arm")
-            assert code == 3 and "no runner asks to arm" in said
+            code, _, message = rig.operate("arm")
+            assert code == 3 and "no runner asks to arm" in message
             first = BridgeClient(rig.socket)
             first.arm()
             wait_for(lambda: rig.operate("arm")[0] == 0, 5, "the permission")

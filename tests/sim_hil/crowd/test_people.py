@@ -86,7 +86,7 @@ def test_a_scene_without_room_is_refused(corridor: Scene) -> None:
 
 
 @pytest.mark.slow
-def test_nobody_enters_walls_or_other_people(hospital: Scene) -> None:
+def test_no_person_enters_walls_or_other_people(hospital: Scene) -> None:
     free = CrowdMap(hospital)
     for rows in _walk(People(hospital, 60, 2), 20.0)[::10]:
         up = rows[rows[:, 6] == 0.0]
@@ -97,7 +97,7 @@ def test_nobody_enters_walls_or_other_people(hospital: Scene) -> None:
 
 
 @pytest.mark.slow
-def test_hardly_anybody_is_stuck_for_15_s_among_sixty(hospital: Scene) -> None:
+def test_few_people_of_sixty_are_stuck_for_15_s(hospital: Scene) -> None:
     people = People(hospital, 60, 4)
     longest = np.zeros(60)
     for _ in range(30 * UPDATE_HZ):
@@ -107,7 +107,7 @@ def test_hardly_anybody_is_stuck_for_15_s_among_sixty(hospital: Scene) -> None:
 
 
 @pytest.mark.slow
-def test_people_speed_up_gently_and_brake_within_what_legs_can_do(hospital: Scene) -> None:
+def test_people_accelerate_and_brake_within_human_limits(hospital: Scene) -> None:
     people = People(hospital, 30, 0)
     before, changes = people.velocities(), []
     for _ in range(15 * UPDATE_HZ):
@@ -207,12 +207,12 @@ def _choose(hall: Scene, other: tuple[float, float, float, float], share: float)
 
 
 @pytest.mark.parametrize("other", [(50.0, 0.0, 0.0, 0.0), (-1.0, 0.0, 1.2, 0.0)], ids=["far ahead", "behind"])
-def test_somebody_out_of_the_way_changes_nothing(hall: Scene, other: tuple[float, float, float, float]) -> None:
+def test_a_person_beside_the_path_changes_nothing(hall: Scene, other: tuple[float, float, float, float]) -> None:
     assert _choose(hall, other, 1)[:2] == (pytest.approx(1.2), pytest.approx(0.0, abs=1e-9))
 
 
 @pytest.mark.parametrize(("other", "share"), [((2.0, 0.0, -1.2, 0.0), 2), ((1.5, 0.05, 0.0, 0.0), 1)])
-def test_somebody_in_the_way_is_passed_on_the_right(
+def test_a_person_in_the_path_is_passed_on_the_right(
     hall: Scene, other: tuple[float, float, float, float], share: float
 ) -> None:
     vx, vy, meet_s = _choose(hall, other, share)
@@ -232,7 +232,7 @@ def test_a_route_through_a_jam_is_less_attractive(hall: Scene) -> None:
     assert away == 1.0 and through > 5.0
 
 
-def test_nobody_stands_at_a_junction_of_corridors() -> None:
+def test_no_person_stands_at_a_junction_of_corridors() -> None:
     office = load_scene("office")
     spots = spots_of(office, CrowdMap(office), 60, np.random.default_rng((20204, 7)))
     assert not [s for s in spots if s.kind == "stand" and 22.0 < s.reach[0] < 23.8 and 5.6 < s.reach[1] < 7.4]

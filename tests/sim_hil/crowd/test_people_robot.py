@@ -91,7 +91,7 @@ def test_some_people_are_inattentive_and_react_later() -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_nobody_runs_into_a_robot_that_stands_in_the_middle_of_a_corridor(seed: int) -> None:
+def test_no_person_runs_into_a_robot_that_stands_in_the_middle_of_a_corridor(seed: int) -> None:
     scene = load_scene("corridor")
     people = People(scene, 8, seed)
     robot, closest, passes = (9.0, 0.0, 0.0), 9.0, 0

@@ -31,7 +31,7 @@ def nothing_is_started(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("name", [None, "", ":1234", "127.0.0.1:1234", "nonsense", ":", "/no/such/socket:0"])
-def test_a_display_that_is_not_there_is_one_line(
+def test_a_missing_display_is_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], name: str | None
 ) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
@@ -86,7 +86,7 @@ def test_a_rate_of_poses_that_physics_does_not_have_is_refused(capsys: pytest.Ca
     assert "--pose-hz" in refusal(capsys, "can", "--pose-hz", rate)
 
 
-def test_every_address_in_the_help_is_one_that_its_protocol_takes() -> None:
+def test_every_address_in_the_help_is_valid_for_its_protocol() -> None:
     examples = re.findall(r"--protocol (can|mavlink) --link (\S+)", hil.EPILOG)
     assert {protocol for protocol, _ in examples} == {"can", "mavlink"}
     for protocol, link in examples:

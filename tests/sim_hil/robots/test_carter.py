@@ -43,7 +43,7 @@ def test_the_tyres_have_the_grip_that_they_should(make: Make) -> None:
 
 
 @pytest.mark.parametrize("rate_hz", RATES_HZ)
-def test_it_stands_still_and_level_until_it_is_told_to_move(make: Make, rate_hz: int) -> None:
+def test_it_stands_still_and_level_until_a_command(make: Make, rate_hz: int) -> None:
     world = make(rate_hz)
     world.run(0.3)
     truth = world.run(1.0)
@@ -74,7 +74,7 @@ def test_a_speed_beyond_the_limit_is_clipped_and_sideways_is_ignored(make: Make)
     assert world.truth().commanded == (1.5, 0.0, 0.0)
 
 
-def test_it_needs_the_way_that_its_brakes_say(make: Make) -> None:
+def test_its_stopping_distance_follows_from_its_brakes(make: Make) -> None:
     world = make().go()
     start_x = world.run(2.5, 1.5).position_m[0]
     truth = world.run(2.0, 0.0)
@@ -137,7 +137,7 @@ def test_it_climbs_an_edge_of_2_cm(make: Make, v: float, rate_hz: int) -> None:
 
 
 @pytest.mark.parametrize("v", [0.3, 1.5])
-def test_a_kerb_of_15_cm_stops_it_and_its_front_bumper_says_so(make: Make, v: float) -> None:
+def test_a_kerb_of_15_cm_stops_it_and_triggers_its_front_bumper(make: Make, v: float) -> None:
     world = make()
     world.box((5.0, 0.0, 0.075), (8.0, 6.0, 0.15))
     world.go()
@@ -180,7 +180,7 @@ def test_pushed_sideways_it_slides_and_its_wheels_do_not_notice(make: Make) -> N
 
 
 @pytest.mark.parametrize(("side", "centre"), [("front", (0.6, 0.0)), ("rear", (-0.6, 0.0))])
-def test_the_bumper_that_is_pushed_says_so_and_lets_go(make: Make, side: str, centre: tuple[float, float]) -> None:
+def test_the_pushed_bumper_reports_contact_and_releases(make: Make, side: str, centre: tuple[float, float]) -> None:
     world = make()
     world.box((*centre, 0.5), (0.1, 2.0, 1.0), grip=0.1)
     world.go()

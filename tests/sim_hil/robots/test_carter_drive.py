@@ -123,7 +123,7 @@ def test_a_motor_never_gives_more_than_its_limit_nor_drives_beyond_its_top_speed
             assert torque * speed <= 0.0
 
 
-def test_a_wheel_that_was_blocked_lets_go_when_it_may_stop() -> None:
+def test_a_blocked_wheel_is_released_by_a_stop() -> None:
     controller = DriveController(DT_S)
     controller.powered = True
     for _ in range(480):
@@ -170,7 +170,7 @@ def test_wheels_of_another_size_than_believed_make_odometry_drift() -> None:
     assert found.T_odom_base.theta_rad == pytest.approx(found.distance_m * 0.002 / TRACK_M, rel=0.02)
 
 
-def test_a_full_battery_lasts_as_long_as_its_energy_says() -> None:
+def test_a_full_battery_lasts_as_long_as_its_energy() -> None:
     battery, hours = CarterBattery(), 0.0
     while battery.read().soc_percent > 0.0:
         battery.draw(ELECTRONICS_W + 30.0, 60.0)
@@ -185,7 +185,7 @@ def test_driving_takes_more_than_standing_and_braking_gives_nothing_back() -> No
     assert load_w(5.0, 3.0, 5.0, 3.0) > ELECTRONICS_W
 
 
-def test_the_current_is_a_mean_over_time_however_often_it_is_asked_for() -> None:
+def test_the_current_is_a_mean_over_time_at_any_reading_rate() -> None:
     asked, silent = CarterBattery(), CarterBattery()
     for step in range(48):  # 0.1 s of nothing, then 0.1 s of 400 W in every second step
         power_w = 400.0 if step >= 24 and step % 2 else 0.0

@@ -70,10 +70,6 @@ def test_a_lying_robot_stands_up_locked_and_only_then_balances(simulation: Simul
     assert truth.accel_mps2 == pytest.approx((0, 0, 9.81), abs=0.4)
 
 
-def test_balance_stand_is_refused_while_lying(simulation: Simulation) -> None:
-    assert simulation.sport(SportAction.BALANCE_STAND) == ERROR_NOT_STANDING
-
-
 @pytest.mark.parametrize("prepare", [(), (SportAction.STAND_UP,), (SportAction.DAMP,)])
 def test_move_has_no_effect_unless_balanced(simulation: Simulation, prepare: tuple[SportAction, ...]) -> None:
     for action in prepare:
@@ -219,7 +215,7 @@ def test_velocities_agree_with_positions(simulation: Simulation) -> None:
     assert moved == pytest.approx(np.mean(velocities, axis=0) * (after.time_s - before.time_s), abs=0.003)
 
 
-def test_feet_carry_the_robot_where_kinematics_says_they_are(simulation: Simulation) -> None:
+def test_feet_carry_the_robot_where_kinematics_places_them(simulation: Simulation) -> None:
     _stand(simulation)
     truth = simulation.truth()
     assert truth.foot_position_body_m[:, 2] == pytest.approx(0.022 - truth.body_height_m, abs=0.006)
@@ -270,7 +266,7 @@ def test_a_running_simulation_keeps_no_files(
     simulation.close()
 
 
-def test_a_simulation_whose_window_was_closed_says_so_and_can_still_be_closed(simulation: Simulation) -> None:
+def test_a_closed_window_is_reported_and_the_simulation_can_still_be_closed(simulation: Simulation) -> None:
     simulation.step()
     pybullet.disconnect(physicsClientId=simulation.client)  # what closing the window does
     for call in (simulation.step, simulation.truth):

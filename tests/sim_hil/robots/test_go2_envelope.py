@@ -82,7 +82,7 @@ def test_the_feet_grip_and_the_rest_of_the_robot_slides(course: Course) -> None:
 
 
 @pytest.mark.slow
-def test_a_robot_that_has_fallen_is_limp_and_stays_down_until_it_is_asked_to_stand(course: Course) -> None:
+def test_a_fallen_robot_is_limp_and_stays_down_until_a_stand_request(course: Course) -> None:
     course.stand()
     course.push((0.0, 600.0, 300.0), 0.1)
     course.wait(4.0)

@@ -46,7 +46,7 @@ def test_the_velocity_is_that_of_the_reported_pose() -> None:
 
 
 @pytest.mark.parametrize("step_m", [0.01, 0.1])
-def test_the_drift_of_a_metre_has_the_levels_size_whatever_the_step(step_m: float) -> None:
+def test_the_drift_of_a_metre_has_the_levels_size_for_any_step(step_m: float) -> None:
     level = LEVELS["typical"]
     # Of an Ornstein-Uhlenbeck rate integrated over s: 2 L s - 2 L^2 (1 - exp(-s / L)), L its correlation length.
     expected = math.sqrt(2.0 - 2.0 * (1.0 - math.exp(-1.0)))

@@ -11,28 +11,10 @@ import pytest
 
 from sim_hil.benchmark.suite.robots import robot_grid
 from sim_hil.scene.nav_grid import NavGrid, length_m
-from sim_hil.scene.scene import Scene, SceneObject, Terrain, Wall, load_scene
+from sim_hil.scene.scene import Terrain, Wall
+from tests.support.benchmark.benchmark_episodes import block, hall
 
 CLEARANCE_M = 0.4
-
-
-def hall(*things: SceneObject, walls: tuple[Wall, ...] = ()) -> Scene:
-    """A 20 m x 10 m floor with nothing else on it."""
-    return replace(
-        load_scene("corridor"),
-        name="hall",
-        start=(-8.0, 0.0, 0.0),
-        goal_xy=(8.0, 0.0),
-        floor_min_m=(-10.0, -5.0),
-        floor_max_m=(10.0, 5.0),
-        walls=walls,
-        objects=things,
-        routes=(),
-    )
-
-
-def block(x: float, y: float, depth: float, width: float, *, turn: float = 0.0, z: float = 0.0) -> SceneObject:
-    return SceneObject(f"block {x} {y}", "cabinet", (x, y, z), turn, (depth, width, 1.0), (0.5, 0.5, 0.5), "")
 
 
 def wall(x: float, y0: float, y1: float) -> Wall:

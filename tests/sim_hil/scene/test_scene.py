@@ -96,7 +96,7 @@ def test_a_scene_is_loaded_by_the_path_of_its_file(tmp_path: Path) -> None:
     assert load_scene(path) == load_scene(str(path)) == PLAIN
 
 
-def test_a_path_that_is_not_there_is_refused_by_naming_it(tmp_path: Path) -> None:
+def test_a_missing_path_is_refused_by_name(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match=r"nowhere\.toml"):
         load_scene(tmp_path / "nowhere.toml")
 
@@ -148,7 +148,7 @@ def test_the_physics_solid_has_the_top_of_the_ground_height(kind: str) -> None:
         assert z <= terrain.height_m(inner_x, inner_y) + 1e-3
 
 
-def test_an_area_knows_what_lies_within_it_even_round_a_corner() -> None:
+def test_an_area_contains_its_points_even_round_a_corner() -> None:
     bent = Area("L", "corridor", ((0, 0), (4, 0), (4, 1), (1, 1), (1, 4), (0, 4)), "the corridor with a bend")
     scene = replace(PLAIN, areas=(bent,))
     assert scene.area_at(3.5, 0.5) is scene.area_at(0.5, 3.5) is bent

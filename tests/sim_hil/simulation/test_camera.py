@@ -156,7 +156,7 @@ def test_an_unknown_robot_is_refused_by_naming_the_known_ones() -> None:
         CameraWorld(load_scene("corridor"), people=0, seed=0, robot="hovercraft")
 
 
-def test_without_its_system_library_the_renderer_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_its_system_library_the_renderer_names_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
     class NoPipes:
         @staticmethod
         def get_global_ptr() -> SimpleNamespace:

@@ -60,7 +60,7 @@ def hospital() -> Iterator[tuple[CameraWorld, Scene]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("index", range(8))
-def test_a_hospitals_picture_is_the_same_with_and_without_what_walls_hide(
+def test_hidden_objects_do_not_change_the_picture_of_a_hospital(
     hospital: tuple[CameraWorld, Scene], index: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     world, scene = hospital
@@ -75,7 +75,7 @@ def test_a_hospitals_picture_is_the_same_with_and_without_what_walls_hide(
     assert differing.sum() < 30
 
 
-def test_a_picture_does_not_depend_on_what_was_drawn_before(hospital: tuple[CameraWorld, Scene]) -> None:
+def test_a_picture_does_not_depend_on_earlier_pictures(hospital: tuple[CameraWorld, Scene]) -> None:
     world, scene = hospital
     states = [_state(scene, *scene.start[:2], heading, 30) for heading in (0.0, 1.0, 2.5)]
     first = world.render(states[0], 128, 128, 16 / 9)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from math import cos, sin
+from math import sin
 
 import numpy as np
 import pytest
@@ -53,15 +53,9 @@ def _row(**changes: float) -> np.ndarray:
     return row
 
 
-def test_hardly_two_of_sixty_people_look_alike() -> None:
+def test_sixty_people_differ_in_appearance() -> None:
     looks = appearances(60, 0, "office")
     assert len({(look.shirt, look.trousers, look.hair, look.hair_style, look.top, look.legs) for look in looks}) > 55
-
-
-def test_adults_have_the_heights_of_adults() -> None:
-    heights = np.array([1.72 * look.scale for look in appearances(200, 1, "sidewalk")])
-    assert 1.49 < heights.min() < 1.60 and 1.85 < heights.max() < 1.98
-    assert abs(heights.mean() - 1.72) < 0.03
 
 
 @pytest.mark.parametrize(
@@ -72,13 +66,13 @@ def test_adults_have_the_heights_of_adults() -> None:
         ("office", {"vest"}, (0, 0)),
     ],
 )
-def test_people_are_dressed_for_where_they_are(scene: str, clothes: set[str], share: tuple[float, float]) -> None:
+def test_clothes_fit_the_scene(scene: str, clothes: set[str], share: tuple[float, float]) -> None:
     worn = np.mean([look.top in clothes for look in appearances(200, 2, scene)])
     assert share[0] <= worn <= share[1]
 
 
 @pytest.mark.parametrize("index", range(12))
-def test_a_person_stands_on_the_ground_and_is_as_tall_as_the_look_says(index: int) -> None:
+def test_a_person_stands_on_the_ground_and_has_the_height_of_the_appearance(index: int) -> None:
     look = appearances(12, 4, "warehouse" if index % 2 else "hospital")[index]
     stage = FakeStage()
     PersonBody(stage, look).pose(_row(swing=0.0, ground=0.14))
@@ -119,18 +113,6 @@ def test_postures_change_without_jumps() -> None:
     for a, b in pairwise(postures):
         for before, after in zip((*a.thighs, *a.shins, *a.forearms), (*b.thighs, *b.shins, *b.forearms), strict=True):
             assert abs(after - before) < 0.2
-
-
-def test_a_seated_person_has_hips_at_the_height_of_a_seat() -> None:
-    posture = limbs(0.0, 0.0, 1.0, 0)
-    assert 0.45 < posture.hips_m < 0.62
-    assert abs(posture.shins[0]) < 0.1 and cos(posture.thighs[0]) < 0.3
-
-
-def test_a_person_on_the_phone_looks_down_at_a_raised_hand() -> None:
-    plain, phone = limbs(0.0, 0.0, 0.0, 0), limbs(0.0, 0.0, 0.0, 2)
-    assert phone.head > plain.head + 0.3
-    assert phone.forearms[0] < plain.forearms[0] - 1.0
 
 
 def test_a_hidden_person_shows_nothing_until_posed_again() -> None:

@@ -70,7 +70,7 @@ def test_a_robot_that_starts_on_a_platform_stands_on_it() -> None:
         assert 0.5 < simulation.pose()[0][2] < 0.7
 
 
-def test_nobody_walks_while_the_robot_gets_ready() -> None:
+def test_no_person_walks_while_the_robot_gets_ready() -> None:
     with simulated(load_scene("corridor"), people=3) as simulation:
         before = simulation.people()
         simulation.settle()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from sim_hil.benchmark.suite.episode import Episode
-from sim_hil.scene.scene import Scene, SceneObject, load_scene
+from sim_hil.scene.scene import Scene, SceneObject, Wall, load_scene
 
 
 def corridor_episode(**changes: object) -> Episode:
@@ -29,7 +29,7 @@ def corridor_episode(**changes: object) -> Episode:
     return Episode(**{**values, **changes})  # type: ignore[arg-type]
 
 
-def hall(*things: SceneObject) -> Scene:
+def hall(*things: SceneObject, walls: tuple[Wall, ...] = ()) -> Scene:
     """A bare floor of 20 m x 10 m."""
     return replace(
         load_scene("corridor"),
@@ -38,12 +38,12 @@ def hall(*things: SceneObject) -> Scene:
         goal_xy=(8.0, 0.0),
         floor_min_m=(-10.0, -5.0),
         floor_max_m=(10.0, 5.0),
-        walls=(),
+        walls=walls,
         objects=things,
         routes=(),
     )
 
 
-def block(x: float, y: float, depth: float, width: float) -> SceneObject:
+def block(x: float, y: float, depth: float, width: float, *, turn: float = 0.0, z: float = 0.0) -> SceneObject:
     """A cabinet to stand in the way."""
-    return SceneObject(f"block {x} {y}", "cabinet", (x, y, 0.0), 0.0, (depth, width, 1.0), (0.5, 0.5, 0.5), "")
+    return SceneObject(f"block {x} {y}", "cabinet", (x, y, z), turn, (depth, width, 1.0), (0.5, 0.5, 0.5), "")

@@ -138,14 +138,14 @@ class FrontEndContract:
     def rig(self) -> Iterator[Rig]:
         raise NotImplementedError
 
-    def test_it_gets_ready_when_asked_and_stays_where_it_is(self, rig: Rig) -> None:
+    def test_it_gets_ready_on_request_and_stays_where_it_is(self, rig: Rig) -> None:
         before = rig.place()
         assert not rig.client.is_ready()
         rig.make_ready()
         assert math.dist(before, rig.place()) < 0.15
         assert not rig.simulation.fell
 
-    def test_it_drives_as_told_and_stops(self, rig: Rig) -> None:
+    def test_it_follows_a_velocity_and_stops(self, rig: Rig) -> None:
         rig.make_ready()
         start = rig.place()
         rig.tell(lambda: rig.client.drive(self.SPEED_MPS, 0.0))
@@ -173,7 +173,7 @@ class FrontEndContract:
         assert rig.speed_mps() < 0.06
         assert rig.simulation.commanded == (0.0, 0.0, 0.0)
 
-    def test_reports_come_with_advancing_stamps_and_say_how_far_it_went(self, rig: Rig) -> None:
+    def test_reports_have_advancing_stamps_and_the_driven_distance(self, rig: Rig) -> None:
         rig.make_ready()
         rig.client.reports.clear()
         start = rig.place()
@@ -208,7 +208,7 @@ class FrontEndContract:
         assert math.dist(where, rig.place()) < 0.05
         assert rig.simulation.commanded == (0.0, 0.0, 0.0)
 
-    def test_the_result_says_what_was_commanded_last(self, rig: Rig) -> None:
+    def test_the_result_has_the_last_command(self, rig: Rig) -> None:
         rig.make_ready()
         rig.tell(lambda: rig.client.drive(self.SPEED_MPS, 0.0))
         wire = rig.front_end.summary()["wire"]

@@ -23,7 +23,7 @@ def test_every_graph_is_profiled_by_operator(artifacts_dir: Path, tmp_path: Path
 
 
 @pytest.mark.parametrize("wrong", [["--graphs", "nothing"], ["--context", "0"], ["--context", "9999"]])
-def test_what_cannot_be_profiled_is_one_line(
+def test_a_graph_that_cannot_be_profiled_is_one_line(
     artifacts_dir: Path, wrong: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["--artifacts", str(artifacts_dir), *wrong]) == 2

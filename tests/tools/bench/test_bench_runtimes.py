@@ -43,13 +43,13 @@ def test_a_ratio_is_the_median_of_the_pairs_not_the_ratio_of_medians() -> None:
     assert paired_ratio(FASTER, [10.0, 30.0, 10.0], [20.0, 60.0, 50.0]) == 2.0
 
 
-def test_our_own_stack_is_shown_but_is_not_the_peer_that_a_bar_is_held_against() -> None:
+def test_our_own_stack_is_listed_but_is_not_the_peer_of_a_bar() -> None:
     verdict = judge(MORE, {"mine": [38.0], "genai": [30.0], "ov": [20.0]}, STACKS)
     assert (verdict.best_peer, verdict.ratio, verdict.reached) == ("ov", 1.9, True)
     assert "genai" in [row.contender for row in verdict.rows]
 
 
-def test_a_bar_that_is_missed_says_so() -> None:
+def test_a_missed_bar_is_reported() -> None:
     verdict = judge(FASTER, {"mine": [10.0], "ov": [14.0]}, STACKS)
     assert verdict.reached is False
     assert "NOT reached" in verdict_text(verdict)
@@ -77,7 +77,7 @@ def test_contenders_have_names_of_their_own_and_assets_that_can_be_made() -> Non
     assert {asset for c in CONTENDERS for asset in c.assets} <= {"reference", *prepare.ASSETS}
 
 
-def test_only_picks_by_name_and_refuses_a_name_that_nobody_has() -> None:
+def test_only_picks_by_name_and_refuses_an_unknown_name() -> None:
     assert {c.stack for c in chosen(["llama*"])} == {"llama"}
     with pytest.raises(ValueError, match="no contender of that name; there are: ours control"):
         chosen(["tensorrt*"])
@@ -156,7 +156,7 @@ def test_time_that_the_host_stole_counts_as_foreign() -> None:
 
 
 @pytest.mark.slow
-def test_in_each_round_everybody_is_asked_once_and_the_order_turns(tmp_path: Path) -> None:
+def test_in_each_round_every_contender_runs_once_and_the_order_rotates(tmp_path: Path) -> None:
     with worker("ok", tmp_path) as a, worker("large", tmp_path) as b:
         for w in (a, b):
             w.ask(LOAD)
@@ -182,7 +182,7 @@ def test_a_contender_that_fails_leaves_the_field_and_the_others_go_on(tmp_path: 
 # Preparation
 
 
-def test_what_has_its_stamp_is_not_made_again(tmp_path: Path) -> None:
+def test_a_stamped_asset_is_not_made_again(tmp_path: Path) -> None:
     made: list[Path] = []
     folder = tmp_path / "asset"
     for content in ({"recipe": 1}, {"recipe": 1}, {"recipe": 2}):

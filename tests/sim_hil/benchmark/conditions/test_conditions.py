@@ -38,7 +38,7 @@ def test_the_robot_halts_at_its_own_stop_only_on_request() -> None:
     assert stays.stays and "halts at its own stop" in stays.describe()
 
 
-def test_a_switch_that_is_not_asked_for_is_the_manifests() -> None:
+def test_a_switch_without_an_option_is_the_manifests() -> None:
     free = asked("--policy", "artifacts:nano", "--decoding", "free")
     resolved = free.with_defaults_of(Decoding.CONSTRAINED, RecoverySwitch.OFF)
     assert (resolved.decoding, resolved.recovery) == ("free", "off")
@@ -57,7 +57,7 @@ def test_an_artifact_directory_means_the_same_in_a_worker_elsewhere() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         (("--policy", "clever"), "expected artifacts:DIR, external:ADDR"),
         (("--policy", "artifacts:"), "expected artifacts:DIR"),
@@ -79,8 +79,8 @@ def test_an_artifact_directory_means_the_same_in_a_worker_elsewhere() -> None:
         (("--policy", "external:h:1", "--external-timeout", "0"), "external timeout"),
     ],
 )
-def test_what_contradicts_itself_is_refused_in_one_line(arguments: tuple[str, ...], says: str) -> None:
-    with pytest.raises(ConditionsError, match=says) as caught:
+def test_contradictory_conditions_are_refused_in_one_line(arguments: tuple[str, ...], message: str) -> None:
+    with pytest.raises(ConditionsError, match=message) as caught:
         asked(*arguments)
     assert "\n" not in str(caught.value)
 

@@ -51,7 +51,7 @@ def test_a_profile_survives_json(times: list[float]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changed", "says"),
+    ("changed", "message"),
     [
         ({"schema": 2}, "schema = 1"),
         ({"generation_s": []}, "1 to 100000 generation times, found 0"),
@@ -65,10 +65,10 @@ def test_a_profile_survives_json(times: list[float]) -> None:
         ({"unit": "s"}, "unknown key 'unit'"),
     ],
 )
-def test_a_wrong_profile_is_one_clear_line(tmp_path: Path, changed: dict[str, Any], says: str) -> None:
+def test_a_wrong_profile_is_one_clear_line(tmp_path: Path, changed: dict[str, Any], message: str) -> None:
     path = tmp_path / "profile.json"
     path.write_text(json.dumps(profile(**changed)))
-    with pytest.raises(LatencyError, match=says) as caught:
+    with pytest.raises(LatencyError, match=message) as caught:
         parse_latency(f"profile:{path}")
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
@@ -80,12 +80,12 @@ def test_a_profile_may_be_toml(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("argument", ["soon", "-1", "nan", "inf", "61", "profile:", "profile:nowhere.json"])
-def test_what_is_no_latency_is_refused(argument: str) -> None:
+def test_an_invalid_latency_is_refused(argument: str) -> None:
     with pytest.raises(LatencyError):
         parse_latency(argument)
 
 
-def test_a_flight_log_gives_each_generations_time_and_when_it_saw(tmp_path: Path) -> None:
+def test_a_flight_log_gives_each_generations_time_and_anchor(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "flight.mcap")
     for started_s, anchor_s, ready_s in ((1.0, 1.5, 4.0), (4.0, 3.9, 6.0)):
         record = {"started_ns": int(started_s * 1e9), "anchor_ns": int(anchor_s * 1e9), "ready_ns": int(ready_s * 1e9)}

@@ -60,7 +60,7 @@ def test_an_episode_that_is_over_takes_no_further_step(reached: EpisodeWorld) ->
         reached.step(FORWARD)
 
 
-def test_who_wants_to_see_the_robot_stay_may_linger() -> None:
+def test_a_policy_may_linger_at_the_goal() -> None:
     with EpisodeWorld(corridor_episode(robot="carter"), WorldOptions(linger_s=1.0)) as world:
         drive(world, FORWARD, 200)
         gaps = np.hypot(*(world.trajectory()[:, :2] - (6.0, 0.0)).T)
@@ -75,10 +75,10 @@ def test_path_and_time_are_those_driven(reached: EpisodeWorld) -> None:
     assert outcome.spl == 1.0 and not outcome.collided and outcome.first_collision_s is None
 
 
-def test_without_drift_odometry_tells_the_true_way(reached: EpisodeWorld) -> None:
+def test_without_drift_odometry_equals_the_true_path(reached: EpisodeWorld) -> None:
     start = SE2(*reached.trajectory()[0])
-    told, true = reached.observe().T_odom_base, start.inverse() @ reached.pose()
-    assert told.as_tuple() == pytest.approx(true.as_tuple(), abs=1e-6)
+    reported, true = reached.observe().T_odom_base, start.inverse() @ reached.pose()
+    assert reported.as_tuple() == pytest.approx(true.as_tuple(), abs=1e-6)
     assert reached.observe().state[0] == pytest.approx(0.8, abs=0.15)
 
 
@@ -97,7 +97,7 @@ def test_an_outcome_before_the_end_is_refused_unless_the_episode_is_stopped() ->
         assert world.done and world.outcome().end == "stopped"
 
 
-def test_somebody_near_is_a_collision_that_the_robot_is_not_told_of() -> None:
+def test_a_person_nearby_is_a_collision_hidden_from_the_robot() -> None:
     with EpisodeWorld(corridor_episode(), scene=hall()) as world:
         pose = world.pose()
         world._simulation._people = np.array([(pose.x_m, pose.y_m + 0.4, 0.0)])
@@ -106,7 +106,7 @@ def test_somebody_near_is_a_collision_that_the_robot_is_not_told_of() -> None:
         assert not world.observe().touching and not world.observe().collided
 
 
-def test_walking_into_a_thing_is_a_collision_with_it() -> None:
+def test_driving_into_an_object_is_a_collision_with_it() -> None:
     scene, episode = hall(block(-6.5, 0.0, 0.5, 2.0)), corridor_episode(start=(-8.0, 0.0, 0.0), goal_xy=(8.0, 0.0))
     with EpisodeWorld(episode, scene=scene) as world:
         for _ in range(35):
@@ -119,7 +119,7 @@ def test_walking_into_a_thing_is_a_collision_with_it() -> None:
         assert outcome.first_collision_s is not None and 0.5 < outcome.first_collision_s < 3.0
 
 
-def test_which_of_many_neighbouring_things_was_touched_is_known() -> None:
+def test_the_touched_one_of_many_neighbouring_objects_is_identified() -> None:
     # Neighbours share a body in the physics engine.
     things = [block(-8.0 + 1.2 * k, side, 0.5, 0.5) for k in range(1, 9) for side in (-1.6, 1.6)]
     scene = hall(*things, block(-6.0, 0.0, 0.5, 1.0))
@@ -142,7 +142,7 @@ def test_options_that_make_no_world_are_refused(options: dict[str, object]) -> N
         WorldOptions(**options)  # type: ignore[arg-type]
 
 
-def test_a_picture_has_the_size_asked_for_and_is_taken_once_an_observation() -> None:
+def test_a_picture_has_the_requested_size_and_is_taken_once_an_observation() -> None:
     with EpisodeWorld(corridor_episode(), WorldOptions(camera=(64, 48))) as world:
         image = world.observe().image
         assert image is not None and image.shape == (48, 64, 3) and image.dtype == np.uint8 and image.std() > 5
@@ -165,7 +165,7 @@ def test_the_same_episode_gives_the_same_bytes_again_and_in_another_process() ->
     assert there.stdout.split()[-1] == here
 
 
-def test_people_walk_at_thirty_hertz_with_the_velocities_told() -> None:
+def test_people_are_updated_at_thirty_hertz_with_the_reported_velocities() -> None:
     with EpisodeWorld(corridor_episode(people=4)) as world:
         drive(world, (0.0, 0.0, 0.0), 20)
         before = world.people()
@@ -190,7 +190,7 @@ def test_drift_grows_with_its_level() -> None:
     assert drift_after_ten_metres("none", 0) < 1e-9 < 0.1 < typical < severe < 5.0
 
 
-def test_velocity_is_the_mean_along_the_robots_own_axes_since_last_asked() -> None:
+def test_velocity_is_the_mean_in_the_body_frame_since_the_last_reading() -> None:
     # A quarter circle of radius 1 m in 1 s: pi/2 m/s forwards, nothing sideways.
     odometer, pose = Odometer("none", 0, SE2(0.0, 0.0, 0.0)), SE2(0.0, 0.0, 0.0)
     assert odometer.velocity() == (0.0, 0.0, 0.0)

@@ -87,7 +87,7 @@ def test_after_a_second_apart_it_is_another_one() -> None:
     assert not _begun("wall", *[""] * (APART_STEPS - 1), "wall")[-1]
 
 
-def test_another_thing_is_another_collision() -> None:
+def test_another_object_is_another_collision() -> None:
     assert _begun("wall", "wall person", "person") == [True, True, False]
 
 
@@ -113,7 +113,7 @@ def test_an_episode_without_a_way_is_refused_at_its_reset() -> None:
     env.close()
 
 
-def test_no_suite_is_taken_by_default_least_of_all_the_benchmarks() -> None:
+def test_no_suite_is_the_default() -> None:
     with pytest.raises(TypeError, match="suite"):
         gymnasium.make(ENV_ID)
 

@@ -64,12 +64,12 @@ def test_it_stands_until_the_first_latency_is_over_and_drives_from_then_on(
     assert [notes["reason"] for _, notes in rows[:6]] == ["no-semantic-state"] * 5 + ["ok"]
 
 
-def test_the_model_is_told_the_delay_and_motion_that_virtual_time_made(policies: dict[str, ArtifactsPolicy]) -> None:
+def test_the_model_receives_the_delay_and_motion_of_virtual_time(policies: dict[str, ArtifactsPolicy]) -> None:
     rows = drive(policies["async"], 12)
-    told = [
+    inputs = [
         (round(notes["delay_s"], 3), round(notes["offset"][0], 3)) for _, notes in rows if notes["delay_s"] is not None
     ]
-    assert told[:6] == [(0.5, 0.25), (0.6, 0.3), (0.7, 0.35), (0.8, 0.4), (0.9, 0.45), (0.5, 0.25)]
+    assert inputs[:6] == [(0.5, 0.25), (0.6, 0.3), (0.7, 0.35), (0.8, 0.4), (0.9, 0.45), (0.5, 0.25)]
 
 
 def test_odometry_that_reports_another_motion_changes_the_motion_offset(policies: dict[str, ArtifactsPolicy]) -> None:
@@ -107,11 +107,11 @@ def test_without_reasoning_it_drives_without_a_text(policies: dict[str, Artifact
     assert {record["new_tokens"] for record in policy.generations()} == {0} and rows[-1][1]["text"] == ""
 
 
-def test_generations_are_told_with_times_of_the_episode(policies: dict[str, ArtifactsPolicy]) -> None:
+def test_generations_have_times_of_the_episode(policies: dict[str, ArtifactsPolicy]) -> None:
     policy = policies["async"]
     drive(policy, 12)
-    told = [(r["started_s"], r["anchor_s"], r["released_s"]) for r in policy.generations()]
-    assert told == [(0.0, 0.0, 0.5), (0.5, 0.5, 1.0)]
+    inputs = [(r["started_s"], r["anchor_s"], r["released_s"]) for r in policy.generations()]
+    assert inputs == [(0.0, 0.0, 0.5), (0.5, 0.5, 1.0)]
 
 
 def test_an_instruction_that_does_not_fit_the_model_is_refused(policies: dict[str, ArtifactsPolicy]) -> None:
@@ -134,7 +134,7 @@ def test_artifacts_that_are_none_are_refused_before_any_episode(tmp_path: Path) 
         check_artifacts(asked(tmp_path))
 
 
-def test_the_world_renders_what_the_model_looks_at(policies: dict[str, ArtifactsPolicy], artifacts_dir: Path) -> None:
+def test_the_world_renders_the_models_camera(policies: dict[str, ArtifactsPolicy], artifacts_dir: Path) -> None:
     assert camera_for(asked(artifacts_dir), policies["async"]) == (128, 128)
     with pytest.raises(ConditionsError, match="needs 128x128"):
         camera_for(asked(artifacts_dir, camera="320x180"), policies["async"])

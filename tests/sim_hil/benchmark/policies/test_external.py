@@ -92,9 +92,7 @@ def connect(address: Address, *, timeout_s: float = 5.0, latency: LatencyProfile
 
 
 @given(header=_headers, payload=st.binary(max_size=300), cuts=st.lists(st.integers(0, 400), max_size=5))
-def test_a_message_survives_the_wire_however_its_bytes_arrive(
-    header: dict[str, Any], payload: bytes, cuts: list[int]
-) -> None:
+def test_a_message_survives_any_fragmentation(header: dict[str, Any], payload: bytes, cuts: list[int]) -> None:
     data, decoder, found = encode(Message(header, payload)), Decoder(), []
     edges = [0, *sorted(min(cut, len(data)) for cut in cuts), len(data)]
     for start, end in itertools.pairwise(edges):
@@ -134,16 +132,16 @@ def test_an_address_that_is_none_is_refused(text: str) -> None:
         Address.parse(text)
 
 
-def test_it_is_told_what_a_robot_knows_and_nothing_of_the_goal(tmp_path: Path) -> None:
-    told: list[Message] = []
+def test_its_request_has_the_robots_inputs_and_not_the_goal(tmp_path: Path) -> None:
+    requests: list[Message] = []
 
     def act(message: Message) -> Answer:
-        told.append(message)
+        requests.append(message)
         return {"type": "act", "step": message.header["step"], "velocity": [0.5, 0.0, 0.1], "text": "ahead"}
 
     def answer(message: Message, channel: Channel) -> Answer:
         if message.kind == "reset":
-            told.append(message)
+            requests.append(message)
         return polite(act)(message, channel)
 
     with serving(tmp_path, answer) as address:
@@ -152,20 +150,20 @@ def test_it_is_told_what_a_robot_knows_and_nothing_of_the_goal(tmp_path: Path) -
         assert policy.act(observation(0.0)) == (0.5, 0.0, 0.1)
         assert policy.notes() == {"text": "ahead", "waypoints": None, "delay_s": 0.0, "clipped": 0}
         policy.close()
-    reset, observe = told
+    reset, observe = requests
     assert set(reset.header) == {
         "type", "episode", "robot", "instruction", "seed", "control_period_s", "limits",
     } and reset.header["instruction"] == "go on"  # fmt: skip
     assert observe.header["state"] == [0.1, 0.0, 0.2] and observe.header["pose"] == [1.0, 2.0, 0.3]
-    assert "goal" not in json.dumps([message.header for message in told])
+    assert "goal" not in json.dumps([message.header for message in requests])
 
 
-def test_it_is_not_told_which_episode_of_the_suite_it_drives(tmp_path: Path) -> None:
-    told: list[Mapping[str, Any]] = []
+def test_its_request_does_not_identify_the_episode(tmp_path: Path) -> None:
+    requests: list[Mapping[str, Any]] = []
 
     def answer(message: Message, channel: Channel) -> Answer:
         if message.kind == "reset":
-            told.append(message.header)
+            requests.append(message.header)
         return driving([0.0, 0.0, 0.0])(message, channel)
 
     with serving(tmp_path, answer) as address:
@@ -173,9 +171,9 @@ def test_it_is_not_told_which_episode_of_the_suite_it_drives(tmp_path: Path) -> 
         for name, seed in (("hospital-reception-20-go2", 10022), ("office-desk-0-go2", 10022)) * 2:
             policy.reset(fakes.episode(name, seed=seed), "go on", None, seed)
         policy.close()
-    first, second, again, _ = told
+    first, second, again, _ = requests
     assert first == again and first["episode"] != second["episode"] and first["seed"] != second["seed"]
-    said = json.dumps(told)
+    said = json.dumps(requests)
     assert "reception" not in said and "desk" not in said and "10022" not in said
 
 
@@ -188,7 +186,7 @@ def test_velocities_are_cut_to_the_robots_limits(tmp_path: Path) -> None:
         policy.close()
 
 
-def test_with_a_latency_an_answer_is_in_force_that_much_later_and_one_is_asked_at_a_time(tmp_path: Path) -> None:
+def test_an_answer_takes_effect_after_its_latency_and_one_request_is_open_at_a_time(tmp_path: Path) -> None:
     asked: list[float] = []
 
     def act(message: Message) -> Answer:
@@ -240,12 +238,12 @@ def test_an_answer_that_is_wrong_is_one_clear_line(tmp_path: Path, said: dict[st
         ({"name": 3}, "name to be a text"),
     ],
 )
-def test_a_server_that_introduces_itself_wrongly_is_refused(tmp_path: Path, change: dict[str, Any], why: str) -> None:
+def test_a_wrong_greeting_is_refused(tmp_path: Path, change: dict[str, Any], why: str) -> None:
     with serving(tmp_path, lambda _m, _c: {**WELCOME, **change}) as address, pytest.raises(ExternalError, match=why):
         connect(address)
 
 
-def test_a_server_that_says_nothing_is_given_up(tmp_path: Path) -> None:
+def test_a_silent_server_is_given_up(tmp_path: Path) -> None:
     with serving(tmp_path, polite(lambda _: None)) as address:
         policy = connect(address, timeout_s=0.2)
         policy.reset(fakes.episode("a"), "go", None, 1)
@@ -275,7 +273,7 @@ def test_a_server_that_trickles_bytes_is_given_up_too(tmp_path: Path) -> None:
         policy.close()
 
 
-def test_no_server_is_one_line_that_says_what_to_do(tmp_path: Path) -> None:
+def test_a_missing_server_is_one_line_with_advice(tmp_path: Path) -> None:
     with pytest.raises(ExternalError, match=r"cannot be reached .*; start it first"):
         connect(Address(path=str(tmp_path / "nobody")))
 

@@ -53,7 +53,7 @@ def test_the_graph_is_the_network(file: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_goal_is_told_in_the_robots_frame(file: Path) -> None:
+def test_the_goal_is_given_in_the_robot_frame(file: Path) -> None:
     policy, episode = PointGoalNetPolicy(file, robot_config()), corridor_episode()
     policy.reset(episode, "not read", None, 0)
     start = SE2(*episode.start)
@@ -63,7 +63,7 @@ def test_the_goal_is_told_in_the_robots_frame(file: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_it_commands_is_within_the_robots_limits(file: Path) -> None:
+def test_its_commands_are_within_the_robots_limits(file: Path) -> None:
     policy, limits = PointGoalNetPolicy(file, robot_config()), robot_config().limits
     policy.reset(corridor_episode(), "", None, 0)
     for _ in range(5):
@@ -81,14 +81,14 @@ def test_another_onnx_file_is_refused(file: Path, tmp_path: Path) -> None:
         PointGoalNetPolicy(other, robot_config())
 
 
-def test_what_is_no_onnx_file_is_refused(tmp_path: Path) -> None:
+def test_a_file_that_is_not_onnx_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "x.onnx"
     path.write_bytes(b"no")
     with pytest.raises(ConditionsError, match="expected a readable ONNX file"):
         PointGoalNetPolicy(path, robot_config())
 
 
-def test_it_does_not_think() -> None:
+def test_it_runs_no_generation() -> None:
     from sim_hil.benchmark.conditions.latency import LatencyProfile
 
     with pytest.raises(ConditionsError, match="latency: expected only with"):

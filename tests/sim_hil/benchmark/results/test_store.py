@@ -45,7 +45,7 @@ def test_a_line_that_was_cut_by_a_death_is_no_result_and_resuming_removes_it(tmp
     assert [r.id for r in read_results(store.directory)] == ["a", "b"]
 
 
-def test_resuming_with_other_conditions_is_refused_and_says_which(tmp_path: Path) -> None:
+def test_resuming_with_other_conditions_is_refused_with_the_difference(tmp_path: Path) -> None:
     made(tmp_path).close()
     other = {**CONFIG, "conditions": {"drift": "severe"}}
     with pytest.raises(StoreError, match=r'conditions of .* differs .*drift: "none" then, "severe" now'):

@@ -51,15 +51,6 @@ def test_each_crowd_of_a_building_has_both_robots() -> None:
     assert len(seen) == 3 * 5 * 2
 
 
-def test_lengths_run_from_short_to_long() -> None:
-    indoors = [e.shortest_m for e in EPISODES if e.scene != "sidewalk"]
-    outdoors = [e.shortest_m for e in EPISODES if e.scene == "sidewalk"]
-    assert 8 <= min(indoors) < 12
-    assert 25 < max(indoors) <= 35
-    assert 30 <= min(outdoors) < 45
-    assert 60 < max(outdoors) <= 80
-
-
 def test_the_threshold_is_the_papers_indoors_and_relaxed_outdoors() -> None:
     assert {e.threshold_m for e in EPISODES if e.scene != "sidewalk"} == {1.5}
     assert all(e.threshold_m > 1.5 for e in EPISODES if e.scene == "sidewalk")

@@ -88,7 +88,7 @@ def test_landmarks_that_no_wording_names_are_found(validator: Validator) -> None
     assert "the instructions name" in problems(validator, landmarks=(SOUND.goal_landmark, other))
 
 
-def test_the_command_says_what_is_wrong_and_exits_with_1(
+def test_the_command_lists_the_problems_and_exits_with_1(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:  # fmt: skip
     path = tmp_path / "wrong.toml"
@@ -99,7 +99,7 @@ def test_the_command_says_what_is_wrong_and_exits_with_1(
     assert "timeout_s" in result["problems"][SOUND.id][0]
 
 
-def test_the_command_refuses_what_it_cannot_read(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_refuses_an_unreadable_suite(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--suite", "nowhere.toml"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
 
@@ -114,7 +114,7 @@ def test_a_plate_is_as_large_in_the_picture_as_optics_say() -> None:
     assert lines.pixels((0.0, 0.0, EYE_M), 0.0, PLATE, 12.0) == pytest.approx(expected, rel=0.03)
 
 
-def test_what_is_behind_the_robot_behind_a_wall_or_too_far_is_not_seen() -> None:
+def test_landmarks_behind_the_robot_a_wall_or_beyond_range_are_not_seen() -> None:
     lines = Sightlines(load_scene("corridor"))
     eye = (0.0, 0.0, EYE_M)
     assert lines.pixels(eye, 3.1, PLATE, 12.0) == 0

@@ -61,7 +61,7 @@ def way() -> RouteDescription:
     return make_task(scene, NavGrid(scene, clearance_m=0.4), (1.0, 1.2, 0.0), machine).route
 
 
-def test_a_way_is_told_by_its_turn_its_count_and_what_it_passes(way: RouteDescription) -> None:
+def test_a_route_is_described_by_turn_count_and_landmarks(way: RouteDescription) -> None:
     (step,) = way.steps
     assert (step.side, step.kind, step.ordinal, step.at_end) == ("left", "corridor", 2, False)
     assert [(thing.name, thing.side) for thing in step.passed] == [("potted plant", "right")]
@@ -77,7 +77,7 @@ def test_doors_are_counted_apart_from_corridors() -> None:
     assert (step.side, step.kind, step.ordinal) == ("right", "room", 1)
 
 
-def test_a_turn_where_the_corridor_ends_is_told_as_such() -> None:
+def test_a_turn_at_the_end_of_a_corridor_is_described_as_such() -> None:
     scene = comb()
     moved = [replace(thing, position_m=(17.0, 7.4, 0.0)) if thing.label == "machine" else thing
              for thing in scene.objects]  # fmt: skip
@@ -132,11 +132,11 @@ def test_a_door_behind_is_not_counted() -> None:
     assert [(step.side, step.ordinal) for step in told_in_tee(1.0, "shelf").steps] == [("right", 1), ("left", 1)]
 
 
-def test_what_one_has_come_out_of_is_not_counted() -> None:
+def test_the_opening_that_the_route_leaves_is_not_counted() -> None:
     assert [(step.side, step.ordinal) for step in told_in_tee(4.4, "machine").steps] == [("right", 1), ("right", 1)]
 
 
-def test_a_goal_of_which_there_are_two_by_the_way_is_refused() -> None:
+def test_an_ambiguous_goal_is_refused() -> None:
     scene = comb()
     twin = replace(scene.objects[0], label="twin", position_m=(2.5, 0.5, 0.0), heading_rad=pi / 2)
     scene = replace(scene, objects=(*scene.objects, twin))
@@ -175,11 +175,11 @@ def test_true_words_are_accepted(text: str, way: RouteDescription) -> None:
         ("Take the second left, mind the third step, stop at the vending machine.", "cannot be read"),
     ],
 )  # fmt: skip
-def test_what_is_not_so_is_found(text: str, problem: str, way: RouteDescription) -> None:
+def test_a_false_description_is_found(text: str, problem: str, way: RouteDescription) -> None:
     assert any(problem in line for line in untrue(text, way)), untrue(text, way)
 
 
-def test_words_are_read_as_claims_in_their_order() -> None:
+def test_a_description_is_read_as_ordered_claims() -> None:
     claims = read("Go past the red bench on the left. Then turn right into the third aisle and wait at the drum.")
     assert claims == [
         Claim("pass", "left", name="red bench"), Claim("turn", "right", 3, "passage"), Claim("goal", name="drum"),
@@ -200,7 +200,7 @@ def test_benchmark_and_training_share_no_pattern(way: RouteDescription) -> None:
     assert len(ours) > 100
 
 
-def test_a_pattern_hangs_neither_on_things_nor_on_sides_nor_on_counts() -> None:
+def test_a_pattern_depends_neither_on_landmarks_nor_on_sides_nor_on_counts() -> None:
     a = "Take the second left and stop at the red vending machine."
     b = "take the fifth right and stop at the bookshelf."
     assert pattern(a) == pattern(b)
@@ -214,7 +214,7 @@ def test_wordings_are_the_same_for_the_same_seed_and_different_from_each_other(w
     assert len({pattern(text) for text in first}) == 8
 
 
-def test_a_turn_that_nothing_tells_from_others_is_refused(way: RouteDescription) -> None:
+def test_an_indistinguishable_turn_is_refused(way: RouteDescription) -> None:
     vague = replace(way.steps[0], ordinal=0, near=(), at_end=False)
     with pytest.raises(WordingError, match="cannot be described"):
         wordings(replace(way, steps=(vague,)), 4, 1, held_out=True)

@@ -150,6 +150,6 @@ def test_a_cluster_whose_processors_come_back_is_not_given_up(bare: NoProcessors
 
 @pytest.mark.slow
 def test_a_node_with_other_code_refuses_its_episodes(tmp_path: Path) -> None:
-    told, files = run_on_node(json.dumps(fakes.task("a", tmp_path).as_json()), "0" * 64, None)
-    content = json.loads(told)
+    answer, files = run_on_node(json.dumps(fakes.task("a", tmp_path).as_json()), "0" * 64, None)
+    content = json.loads(answer)
     assert content["result"] is None and content["refused_code"] == 2 and "other code" in content["why"] and not files

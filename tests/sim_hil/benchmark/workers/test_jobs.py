@@ -74,17 +74,19 @@ def test_an_attempt_that_ends_without_a_result_is_run_again_once(tmp_path: Path)
 
 
 def test_an_episode_whose_process_always_dies_is_a_failed_run_and_in_no_rate(tmp_path: Path) -> None:
-    store, told = store_in(tmp_path), []
-    run_all(tasks_in(store, "a", "b"), Scripted(1, a=["dies", "dies"]), store, watcher=RunWatcher(failed=told.append))
+    store, failures = store_in(tmp_path), []
+    run_all(
+        tasks_in(store, "a", "b"), Scripted(1, a=["dies", "dies"]), store, watcher=RunWatcher(failed=failures.append)
+    )
     assert [r.id for r in store.results] == ["b"]
     assert (
         [(f.id, f.attempts, f.why) for f in store.failed]
         == [("a", 2, "died")]
-        == [(f.id, f.attempts, f.why) for f in told]
+        == [(f.id, f.attempts, f.why) for f in failures]
     )
 
 
-def test_a_result_that_is_told_twice_counts_once(tmp_path: Path) -> None:
+def test_a_result_that_is_reported_twice_counts_once(tmp_path: Path) -> None:
     store = store_in(tmp_path)
     run_all(tasks_in(store, "a", "b"), Scripted(2, a=["twice"], b=["twice"]), store)
     assert sorted(r.id for r in read_results(store.directory)) == ["a", "b"]
@@ -105,7 +107,7 @@ def test_a_stop_ends_the_run_with_what_is_finished(tmp_path: Path) -> None:
     assert not finished and len(read_results(store.directory)) == 2 and backend.closed
 
 
-def test_a_killed_worker_process_is_found_by_its_signal_and_its_last_words(tmp_path: Path) -> None:
+def test_a_killed_worker_process_is_reported_with_its_signal_and_its_last_lines(tmp_path: Path) -> None:
     store = store_in(tmp_path)
     run_all(tasks_in(store, "dies"), LocalJobs(1, FAKE_WORKER), store)
     assert store.failed[0].why == "its process gave no result: ended by SIGKILL: out of luck"
@@ -124,7 +126,7 @@ def test_half_a_result_is_none(tmp_path: Path) -> None:
     assert not store.results and store.failed[0].why == "its process gave no result: ended with exit code 0"
 
 
-def test_what_no_further_attempt_can_mend_ends_the_run_with_its_line(tmp_path: Path) -> None:
+def test_a_permanent_failure_ends_the_run_with_its_line(tmp_path: Path) -> None:
     store = store_in(tmp_path)
     with pytest.raises(RefusedRunError, match="episode refuses: no such scene") as caught:
         run_all(tasks_in(store, "refuses"), LocalJobs(1, FAKE_WORKER), store)

@@ -108,7 +108,7 @@ def test_a_babbler_that_leaves_gaps_delays_the_others() -> None:
 @pytest.mark.parametrize(
     "text", ["drop", "drop=", "drop=x", "drop=-0.1", "drop=1.5", "drop=nan", "drip=0.1", "bus_off_every_s=0.1"]
 )
-def test_a_plan_that_makes_no_sense_is_refused(text: str) -> None:
+def test_an_invalid_plan_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="expected"):
         parse_plan(FaultPlan, [text])
 

@@ -119,7 +119,7 @@ def test_a_second_station_watches_and_does_not_drive(rig: Rig) -> None:
         other.close()
 
 
-def test_more_addresses_than_it_remembers_are_turned_away(rig: Rig) -> None:
+def test_excess_addresses_are_refused(rig: Rig) -> None:
     clients = [MavlinkClient(("127.0.0.1", _port(rig)), system=200 + n) for n in range(MAX_LEARNED + 2)]
     try:
         for client in clients:
@@ -130,7 +130,7 @@ def test_more_addresses_than_it_remembers_are_turned_away(rig: Rig) -> None:
             client.close()
 
 
-def test_a_fixed_address_is_called_with_heartbeats_only_until_it_answers() -> None:
+def test_a_fixed_address_receives_only_heartbeats_until_it_answers() -> None:
     listener = MavlinkClient(("127.0.0.1", 9))
     rig = open_rig(f"udp:127.0.0.1:0,to=127.0.0.1:{listener.address[1]}")
     try:

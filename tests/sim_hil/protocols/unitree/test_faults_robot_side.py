@@ -50,7 +50,7 @@ def faults_with(name: str, **values: object) -> StateFaults:
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_every_fault_survives_the_line_that_asks_for_it(name: str) -> None:
+def test_every_fault_survives_its_request_line(name: str) -> None:
     assert parse(command(name).line()) == command(name)
 
 

@@ -200,14 +200,14 @@ class TestGaits:
         desk.run(1.0)
         assert self.top_speed(desk) == pytest.approx(0.8)
 
-    @pytest.mark.parametrize("told", [True, False])
-    def test_a_fallen_robot_stands_up_by_itself_only_with_auto_recovery(self, desk: Desk, told: bool) -> None:
-        assert desk.ask(2054, data=told) == (0, "") and json.loads(desk.ask(2055)[1]) == {"data": told}
+    @pytest.mark.parametrize("enabled", [True, False])
+    def test_a_fallen_robot_stands_up_by_itself_only_with_auto_recovery(self, desk: Desk, enabled: bool) -> None:
+        assert desk.ask(2054, data=enabled) == (0, "") and json.loads(desk.ask(2055)[1]) == {"data": enabled}
         desk.measured = desk.measured._replace(up=0.1)
         desk.run(0.1)
         assert desk.behaviour.mode == 7
         desk.run(2.5)
-        assert desk.behaviour.mode == (8 if told else 7)
+        assert desk.behaviour.mode == (8 if enabled else 7)
 
 
 class TestSwitching:

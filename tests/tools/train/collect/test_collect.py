@@ -66,7 +66,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 # -- who makes what ---------------------------------------------------------------------------------------------------
 
 
-def test_every_drive_that_was_asked_for_comes_and_no_other(whole: Dataset) -> None:
+def test_every_requested_drive_is_collected_and_no_other(whole: Dataset) -> None:
     assert whole.ids == tuple(f"e{number:05d}" for number in range(COUNT))
     assert Counter(_begun(whole.folder)).most_common(1)[0][1] == 1
 
@@ -115,7 +115,7 @@ def test_a_process_that_ends_badly_after_its_last_drive_costs_nothing(tmp_path: 
     assert len(_collect(tmp_path, count=8)) == 8
 
 
-def test_a_process_that_never_begins_ends_the_collection_with_its_last_words(tmp_path: Path, faulty: Faulty) -> None:
+def test_a_process_that_never_begins_ends_the_collection_with_its_last_lines(tmp_path: Path, faulty: Faulty) -> None:
     faulty(deaf=True)
     with pytest.raises(StageFailedError, match=r"e00000 .* exit code 5: no hands"):
         _collect(tmp_path, count=8)
@@ -127,7 +127,7 @@ def test_a_refusal_ends_the_collection(tmp_path: Path, faulty: Faulty) -> None:
         _collect(tmp_path, count=8)
 
 
-def test_when_most_drives_give_nothing_it_says_so_instead_of_going_on(tmp_path: Path, faulty: Faulty) -> None:
+def test_when_most_drives_fail_the_collection_ends_with_an_error(tmp_path: Path, faulty: Faulty) -> None:
     faulty(drop=[f"e{number:05d}" for number in range(80)])
     with pytest.raises(StageFailedError, match="gave nothing to learn, the last: it left the way"):
         _collect(tmp_path, count=80)
@@ -151,7 +151,7 @@ def test_no_process_is_left_behind(tmp_path: Path, faulty: Faulty, monkeypatch: 
 # -- orders and draws -------------------------------------------------------------------------------------------------
 
 
-def test_nothing_is_collected_from_what_evaluation_and_reinforcement_learning_drive_in() -> None:
+def test_layouts_of_evaluation_and_reinforcement_learning_are_not_collected() -> None:
     found = {
         replace(_collection(), seed=seed, turn=1).orders(Path("folder"), lambda _: False)[0].scenario_seed
         for seed in range(2000)
@@ -160,7 +160,7 @@ def test_nothing_is_collected_from_what_evaluation_and_reinforcement_learning_dr
     assert EvaluateConfig().scenario_seed in KEPT_SEEDS
 
 
-def test_what_is_drawn_has_the_shares_that_were_asked_for() -> None:
+def test_scenarios_are_drawn_in_the_requested_shares() -> None:
     config = CollectConfig(noise_share=0.3, sharp_share=0.2, typical_drift_share=0.5, severe_drift_share=0.1)
     draws = [Draw.of(config, 7, number) for number in range(3000)]
     shares = Counter(draw.drift for draw in draws)
@@ -182,19 +182,19 @@ def test_a_real_drive_is_made_of_a_training_scenario_and_is_the_same_in_any_proc
     with DatasetWriter(tmp_path / "here") as here, DatasetWriter(tmp_path / "process") as there:
         order = Order(str(here.folder), "e", 7, 3, 0, 1, (), config)
         begun, made = list(messages(plain(order)))
-        workers, told = collection.Workers(collection.WORKER, 1), []
+        workers, received = collection.Workers(collection.WORKER, 1), []
         workers.start("e", plain(replace(order, folder=str(there.folder))), tmp_path / "e.log")
         while workers.running():
-            told += [each.message for each in workers.wait(1.0)]
+            received += [each.message for each in workers.wait(1.0)]
         workers.close()
         drive = Drive.load(here.path("e00000"))
-    assert begun == {"begun": "e00000"} and told == [begun, dict(made), None]
+    assert begun == {"begun": "e00000"} and received == [begun, dict(made), None]
     assert drive.about.kind == "corridor" and drive.about.outcome == "reached" and drive.about.driver == "expert"
     assert len(drive.wordings) >= 8 and not any(is_held_out(text) for text in drive.wordings)
     assert len(drive.traces) == (len(drive) - 1) // 10 + 1
 
 
-def test_the_stage_collects_what_the_recipe_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_stage_collects_by_the_recipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(collection.fill, "__kwdefaults__", {**collection.fill.__kwdefaults__, "command": FAKE})
     result = collect(_job(tmp_path))
     assert result["drives"] == 3 and result["sha256"] == Dataset.open(tmp_path / "collect").sha256

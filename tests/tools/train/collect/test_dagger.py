@@ -84,11 +84,11 @@ def test_in_the_experts_stretches_the_policy_goes_on_seeing(
     monkeypatch.setattr(ArtifactsPolicy, "act", watched)
     image = np.full((128, 128, 3), 90, np.uint8)
     with PolicyDriver(_options(artifacts, 1.0), corridor_episode(), np.random.default_rng(1)) as policy:
-        told = [
+        inputs = [
             policy.steer(Observation(tick / 10, image, (0.0, 0.0, 0.0), SE2(0.0, 0.0, 0.0), False, False), wanted)
             for tick in range(5)
         ]
-    assert told == [(wanted, EXPERT)] * 5 and seen == [0.0, 0.1, 0.2, 0.3, 0.4]
+    assert inputs == [(wanted, EXPERT)] * 5 and seen == [0.0, 0.1, 0.2, 0.3, 0.4]
 
 
 def test_other_artifacts_than_the_rounds_are_refused(artifacts: Artifacts) -> None:
@@ -145,7 +145,7 @@ def test_new_drives_of_the_expert_come_with_a_round_in_layouts_of_their_own(
 
 
 @pytest.mark.parametrize(("newest_only", "seen"), [(True, ("d2-0", "n2-0")), (False, ("d1-0", "d2-0", "e0", "n2-0"))])
-def test_what_goes_on_learns_from_all_drives_or_from_the_newest_rounds(
+def test_training_after_a_round_uses_all_drives_or_the_newest_rounds(
     tmp_path: Path, newest_only: bool, seen: tuple[str, ...]
 ) -> None:
     job = _job(tmp_path, newest_only=newest_only)

@@ -108,7 +108,7 @@ def test_a_drive_off_the_described_route_is_rejected() -> None:
         _drive(_expert_command, way=np.array(((0.0, 9.0), (6.0, 9.0))), timeout_s=4.0)
 
 
-def test_what_is_too_short_is_not_kept() -> None:
+def test_a_short_drive_is_not_kept() -> None:
     with pytest.raises(NothingToLearnError, match="less than 3 s are usable"):
         _drive(_expert_command, timeout_s=1.0)
 
@@ -116,7 +116,7 @@ def test_what_is_too_short_is_not_kept() -> None:
 # -- a policy's drives ------------------------------------------------------------------------------------------------
 
 
-def test_where_a_policy_drives_the_label_is_what_the_expert_would_do(standing: Recorded) -> None:
+def test_where_a_policy_drives_the_label_is_the_experts_plan(standing: Recorded) -> None:
     assert standing.outcome == "timeout" and len(standing.arrays["pose"]) == 40
     assert np.all(standing.arrays["by"] == POLICY)
     assert np.ptp(standing.arrays["pose"][:, 0]) < 0.05
@@ -171,7 +171,7 @@ def test_a_policys_collisions_are_kept_and_its_falls_are_not() -> None:
 
 
 @pytest.mark.slow
-def test_a_drive_that_lingers_comes_to_rest_at_the_goal_and_says_so_of_every_frame() -> None:
+def test_a_drive_that_lingers_comes_to_rest_at_the_goal_and_labels_every_frame_so() -> None:
     lingering = _drive(_expert_command, linger_s=6.0)
     pose = lingering.arrays["pose"]
     assert lingering.outcome == "reached"
@@ -181,7 +181,7 @@ def test_a_drive_that_lingers_comes_to_rest_at_the_goal_and_says_so_of_every_fra
 
 
 @pytest.mark.slow
-def test_on_a_detour_it_leaves_its_way_and_the_label_is_what_brings_it_back() -> None:
+def test_on_a_detour_the_label_leads_back_to_the_route() -> None:
     aside = _drive(_expert_command, detour=Detour((1.3, 0.5), 3.5, 1.0), timeout_s=60.0)
     by, pose = aside.arrays["by"], aside.arrays["pose"]
     assert aside.outcome == "reached" and set(by) == {EXPERT, NOISE}

@@ -74,7 +74,7 @@ def test_the_experts_share_is_about_its_chance() -> None:
     assert isclose(np.mean([by == EXPERT for _, by in _shared(0.3, 20_000)]), 0.3, abs_tol=0.06)
 
 
-def test_nobody_drives_for_less_than_two_seconds() -> None:
+def test_each_stretch_lasts_at_least_two_seconds() -> None:
     assert min(ticks for _, ticks in _runs([by for _, by in _shared(0.5)])) >= 20
 
 
@@ -104,7 +104,7 @@ def place(scenario: Scenario, after_m: float) -> tuple[float, float]:
 
 
 @pytest.mark.slow
-def test_it_is_to_somewhere_that_the_robot_fits_and_is_begun_before_the_ways_end() -> None:
+def test_a_detour_leads_to_free_space_and_begins_before_the_routes_end() -> None:
     for scenario in all_scenarios():
         grid = scenario.site.robot_grid(scenario.episode.robot)
         for detour in detours(scenario, 4):
@@ -113,7 +113,7 @@ def test_it_is_to_somewhere_that_the_robot_fits_and_is_begun_before_the_ways_end
 
 
 @pytest.mark.slow
-def test_some_take_a_wrong_opening_and_some_go_anywhere() -> None:
+def test_some_detours_take_a_wrong_opening_and_others_any_free_place() -> None:
     scenario = scenarios("hospital")[1]
     wrong = {detour.to for detour in mistakes(scenario, 60)}
     share = sum(detour is not None and detour.to in wrong for detour in detours(scenario, 40)) / 40
@@ -140,6 +140,6 @@ def test_a_wrong_opening_leads_into_an_area_near_a_step_that_is_not_the_one_to_b
 
 
 @pytest.mark.slow
-def test_where_nothing_is_to_be_taken_there_is_no_wrong_opening() -> None:
+def test_a_route_without_turns_has_no_wrong_opening() -> None:
     plain = [scenario for scenario in all_scenarios() if not scenario.route.steps]
     assert plain and not any(mistakes(scenario) for scenario in plain)

@@ -96,7 +96,7 @@ def test_it_goes_off_the_way_and_comes_back_to_it(straight_there: Recorded, with
 
 
 @pytest.mark.slow
-def test_it_says_turn_back_where_the_way_on_lies_behind_it(with_a_detour: Recorded) -> None:
+def test_its_plan_is_turn_back_where_the_route_lies_behind_it(with_a_detour: Recorded) -> None:
     plans = with_a_detour.arrays["plan_xy"][::10, 0]
     behind = np.abs(np.arctan2(plans[:, 1], plans[:, 0])) > 2.0
     says = np.array([trace["plan"] == "turn back" for trace in with_a_detour.traces])
@@ -163,12 +163,12 @@ def test_its_process_writes_a_drive_that_can_be_read_in_seconds(tmp_path: Path) 
         drive.frame(7)
 
 
-def test_seconds_in_which_somebody_is_in_the_way_are_left_out(tmp_path: Path) -> None:
+def test_seconds_with_a_person_in_the_path_are_left_out(tmp_path: Path) -> None:
     def says(motion: str) -> int:
         drive = made_up_drive(f"w{len(motion)}", 40)
         traces = tuple({**trace, "motion": motion if trace["k"] == 10 else "nobody near"} for trace in drive.traces)
-        told = replace(drive, about=replace(drive.about, traces=traces))
-        dataset = write_dataset(tmp_path / f"{len(motion)}", [told])
+        relabelled = replace(drive, about=replace(drive.about, traces=traces))
+        dataset = write_dataset(tmp_path / f"{len(motion)}", [relabelled])
         return sum(anchor.k == 10 for anchor in tour_anchors(dataset, dataset.ids))
 
     assert says("person ahead 2 m coming") == says("person left 1 m standing, person ahead 1 m leaving") == 0

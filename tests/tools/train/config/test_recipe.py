@@ -46,7 +46,7 @@ def test_a_setting_may_change_the_network() -> None:
 
 
 @pytest.mark.parametrize(
-    ("setting", "says"),
+    ("setting", "message"),
     [
         ("sft.epoch=3", "did you mean epochs"),
         ("stf.epochs=3", "did you mean sft"),
@@ -58,14 +58,14 @@ def test_a_setting_may_change_the_network() -> None:
         ("seed=-1", "seed from 0"),
     ],
 )
-def test_a_setting_of_nothing_that_is_there_is_one_clear_line(setting: str, says: str) -> None:
-    with pytest.raises(RecipeError, match=says) as caught:
+def test_an_unknown_setting_is_one_clear_line(setting: str, message: str) -> None:
+    with pytest.raises(RecipeError, match=message) as caught:
         load_recipe("nano", [setting])
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         ("schema = 2", "schema = 1"),
         ('schema = 1\nname = "a"\nseed = 1', "table \\[model\\]"),
@@ -77,16 +77,16 @@ def test_a_setting_of_nothing_that_is_there_is_one_clear_line(setting: str, says
         ("schema =", "recipe.toml"),
     ],
 )
-def test_a_wrong_recipe_is_one_clear_line(text: str, says: str, tmp_path: Path) -> None:
+def test_a_wrong_recipe_is_one_clear_line(text: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "recipe.toml"
     path.write_text(text)
-    with pytest.raises(RecipeError, match=says) as caught:
+    with pytest.raises(RecipeError, match=message) as caught:
         load_recipe(str(path))
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("name", ["nono", "nowhere.toml", "recipe.json"])
-def test_a_recipe_that_is_not_there_is_said(name: str) -> None:
+def test_a_missing_recipe_is_reported(name: str) -> None:
     with pytest.raises(RecipeError, match=name):
         load_recipe(name)
 
@@ -137,7 +137,7 @@ def test_numbers_outside_their_range_are_refused_by_name(kind: type) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "changed", "says"),
+    ("kind", "changed", "message"),
     [
         (collect.CollectConfig, {"typical_drift_share": 0.7, "severe_drift_share": 0.4}, "shares"),
         (collect.CollectConfig, {"jpeg_quality_min": 96}, "jpeg_quality"),
@@ -159,6 +159,6 @@ def test_numbers_outside_their_range_are_refused_by_name(kind: type) -> None:
         (sft.EvalConfig, {"gap_s": 1.5}, "whole seconds"),
     ],
 )  # fmt: skip
-def test_numbers_that_contradict_each_other_are_refused(kind: type, changed: dict[str, object], says: str) -> None:
-    with pytest.raises(ValueError, match=says):
+def test_numbers_that_contradict_each_other_are_refused(kind: type, changed: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         kind(**changed)

@@ -43,7 +43,7 @@ def test_without_its_pictures_everything_else_is_there(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "says"),
+    ("name", "value", "message"),
     [
         ("pose", np.zeros((59, 3)), "pose: expected"),
         ("state", np.zeros((60, 3)), "state: expected float32"),
@@ -52,8 +52,8 @@ def test_without_its_pictures_everything_else_is_there(tmp_path: Path) -> None:
         ("future_steps", np.full(60, 51, np.int16), "0 to 50"),
     ],
 )
-def test_arrays_that_cannot_be_are_refused(name: str, value: np.ndarray, says: str) -> None:
-    with pytest.raises(TrainError, match=says):
+def test_arrays_that_cannot_be_are_refused(name: str, value: np.ndarray, message: str) -> None:
+    with pytest.raises(TrainError, match=message):
         replace(drive(), **{name: value})
 
 
@@ -119,7 +119,7 @@ def test_verifying_finds_one_wrong_byte(tmp_path: Path) -> None:
         Dataset.open(tmp_path, verify=True)
 
 
-def test_a_folder_that_is_no_data_set_says_so(tmp_path: Path) -> None:
+def test_a_folder_that_is_no_data_set_is_refused(tmp_path: Path) -> None:
     with pytest.raises(TrainError, match="record one with collect"):
         Dataset.open(tmp_path)
 
@@ -127,7 +127,7 @@ def test_a_folder_that_is_no_data_set_says_so(tmp_path: Path) -> None:
 # -- writing them -----------------------------------------------------------------------------------------------------
 
 
-def test_a_writer_goes_on_with_what_is_there(tmp_path: Path) -> None:
+def test_a_writer_continues_an_existing_data_set(tmp_path: Path) -> None:
     dataset(tmp_path, drive("e0", frames=20))
     with DatasetWriter(tmp_path) as writer:
         assert writer.has("e0") and not writer.has("e1")

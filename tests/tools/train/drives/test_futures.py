@@ -35,7 +35,7 @@ def _choice(
 # -- what was chosen --------------------------------------------------------------------------------------------------
 
 
-def test_where_the_plan_says_where_it_is_the_label_is_the_plan() -> None:
+def test_on_the_plan_the_label_is_the_plan() -> None:
     choice = _choice(0.6, 0.5)
     future = chosen_future(SE2(0.0, 0.0, 0.0), choice, AHEAD)
     at = np.arange(2, 41, 2) - 1  # every 0.2 s up to 4 s
@@ -93,7 +93,7 @@ def test_the_experts_own_drive_is_labelled_with_itself() -> None:
     assert np.all(steps == FUTURE_STEPS)
 
 
-def test_frames_whose_next_five_seconds_are_disturbed_take_what_was_chosen() -> None:
+def test_frames_whose_next_five_seconds_are_disturbed_take_the_experts_plan() -> None:
     by = np.full(200, EXPERT, np.uint8)
     by[100:110] = NOISE
     future, _, poses, chosen = _labels(by)
@@ -102,7 +102,7 @@ def test_frames_whose_next_five_seconds_are_disturbed_take_what_was_chosen() -> 
     assert np.allclose(future[50], relative(poses[50], poses[51:101]))
 
 
-def test_at_the_end_what_was_chosen_there_goes_on() -> None:
+def test_at_the_end_the_experts_plan_continues() -> None:
     poses = arc(100)
     plan = chosen_future(SE2(0.0, 0.0, 0.0), _choice(0.8), AHEAD)
     future, steps = label_futures(poses, np.tile(plan, (100, 1, 1)), np.full(100, EXPERT), goes_on=True)
@@ -113,7 +113,7 @@ def test_at_the_end_what_was_chosen_there_goes_on() -> None:
     assert np.allclose(future[89, 10], there.as_tuple(), atol=1e-9)
 
 
-def test_before_trouble_only_what_was_driven_is_known() -> None:
+def test_before_a_fall_only_the_driven_steps_are_labelled() -> None:
     future, steps, poses, _ = _labels(np.full(100, EXPERT, np.uint8), goes_on=False)
     assert steps[49] == 50 and steps[50] == 49 and steps[98] == 1 and steps[99] == 0
     assert np.allclose(future[90, :9], relative(poses[90], poses[91:]))
@@ -122,7 +122,7 @@ def test_before_trouble_only_what_was_driven_is_known() -> None:
 
 
 @pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (2.0, -1.0, 3.1), (-4.0, 5.0, -2.0)])
-def test_relative_is_what_se2_says(origin: tuple[float, float, float]) -> None:
+def test_relative_equals_the_se2_composition(origin: tuple[float, float, float]) -> None:
     poses = np.array([(1.0, 2.0, 0.3), (-3.0, 0.5, -3.0), (0.0, 0.0, pi - 0.01)])
     expected = [(SE2(*origin).inverse() @ SE2(*(float(v) for v in pose))).as_tuple() for pose in poses]
     assert np.allclose(relative(np.array(origin), poses), expected, atol=1e-12)

@@ -45,7 +45,7 @@ def _said(progress: RouteProgress, points: Points) -> list[Progress]:
 
 @pytest.mark.parametrize("way", [_told_way, _expert_way])
 @pytest.mark.parametrize("kind", KINDS)
-def test_whoever_takes_the_kth_opening_has_passed_k_less_one(kind: str, way) -> None:  # type: ignore[no-untyped-def]
+def test_a_robot_that_takes_the_kth_opening_has_passed_k_less_one(kind: str, way) -> None:  # type: ignore[no-untyped-def]
     for scenario in scenarios(kind):
         said = _said(progress_of(scenario), way(scenario))
         for index, step in enumerate(scenario.route.steps):
@@ -69,7 +69,7 @@ def test_it_begins_with_the_first_turn_and_ends_on_the_last_leg() -> None:
         assert progress.at(SE2(*scenario.task.goal, 0.0)) == Progress(steps + 1, steps, 0)
 
 
-def test_whoever_drives_past_the_turn_is_still_before_it_and_has_passed_it() -> None:
+def test_a_robot_that_misses_the_turn_keeps_it_as_next_and_counts_the_opening() -> None:
     checked = 0
     for scenario in all_scenarios():
         progress, way = progress_of(scenario), _told_way(scenario)

@@ -132,7 +132,7 @@ def test_kinds_come_in_their_shares_even_in_a_short_run() -> None:
 
 
 @pytest.mark.parametrize("kinds", [{"castle": 1.0}, {"office": -1.0}, {"office": 0.0}, {}, {"office": float("nan")}])
-def test_shares_that_make_no_sense_are_refused(kinds: dict[str, float]) -> None:
+def test_invalid_shares_are_refused(kinds: dict[str, float]) -> None:
     with pytest.raises(ScenarioError):
         next(training_episodes(0, 1, kinds))
 

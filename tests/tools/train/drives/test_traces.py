@@ -120,7 +120,7 @@ def test_a_header_that_does_not_match_the_grammar_is_refused(wrong: dict[str, st
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_plan_is_the_next_told_step_or_to_stop(kind: str) -> None:
+def test_the_plan_is_the_next_described_step_or_to_stop(kind: str) -> None:
     for scenario in scenarios(kind):
         tracer, steps = _tracer(scenario), scenario.route.steps
         for pose in _poses(scenario, 5.0):
@@ -135,12 +135,12 @@ def test_the_plan_is_the_next_told_step_or_to_stop(kind: str) -> None:
                 assert (action.side, action.area) == ("ahead" if step.side == "straight" else step.side, step.kind)
 
 
-def test_whoever_means_to_be_behind_itself_turns_back() -> None:
+def test_a_goal_behind_the_robot_gives_turn_back() -> None:
     scenario = scenarios(CORRIDOR)[0]
     assert _tracer(scenario).trace(SE2(*scenario.task.start), *NOBODY, [(-1.0, 0.2)]).plan == Plan(TurnBack())
 
 
-def test_whoever_stands_before_somebody_waits() -> None:
+def test_a_robot_that_stands_before_a_person_waits() -> None:
     scenario = scenarios(CORRIDOR)[0]
     pose = SE2(5.0, -0.2, 0.0)
     tracer, person, still = _tracer(scenario), _person(pose, 1.2, 0.0), np.zeros((1, 2))
@@ -181,7 +181,7 @@ def test_an_opening_that_counts_is_named_on_its_side_before_one_is_there() -> No
         ((2.0, -1.1), (0.0, 0.0), "person right 2 m standing"),
     ],
 )
-def test_people_are_told_by_where_they_are_and_how_they_walk(
+def test_people_are_described_by_place_and_motion(
     place: tuple[float, float], velocity: tuple[float, float], said: str
 ) -> None:
     scenario = scenarios(CORRIDOR)[0]
@@ -192,13 +192,13 @@ def test_people_are_told_by_where_they_are_and_how_they_walk(
 
 
 @pytest.mark.parametrize("place", [(-2.0, 0.0), (0.0, 1.5), (PEOPLE_M + 0.2, 0.0)])
-def test_nobody_behind_beside_or_far_is_spoken_of(place: tuple[float, float]) -> None:
+def test_people_behind_beside_or_far_are_not_mentioned(place: tuple[float, float]) -> None:
     scenario = scenarios(CORRIDOR)[0]
     pose = SE2(13.0, 0.0, 0.0)
     assert _tracer(scenario).trace(pose, _person(pose, *place), np.zeros((1, 2))).people == ()
 
 
-def test_only_the_nearest_two_are_spoken_of_and_many_are_many() -> None:
+def test_only_the_nearest_two_people_are_mentioned_and_a_crowd_is_many() -> None:
     scenario = scenarios(CORRIDOR)[0]
     pose = SE2(13.0, 0.0, 0.0)
     people = np.concatenate([_person(pose, 2.0 + k, 0.9 - 0.45 * k) for k in range(4)])
@@ -207,7 +207,7 @@ def test_only_the_nearest_two_are_spoken_of_and_many_are_many() -> None:
     assert trace.situation == Situation("corridor", crowd=2)
 
 
-def test_what_somebody_hides_is_not_spoken_of() -> None:
+def test_landmarks_hidden_by_a_person_are_not_mentioned() -> None:
     scenario = scenarios(CORRIDOR)[0]
     thing = next(thing for thing in scenario.scene.objects if thing.label == "vending machine")
     pose = SE2(thing.position_m[0] - 6.0, 0.0, 0.0)
@@ -250,7 +250,7 @@ def office() -> Iterator[tuple[Scenario, CameraWorld]]:
 
 
 @pytest.mark.slow
-def test_a_person_is_spoken_of_just_when_the_picture_shows_one(office: tuple[Scenario, CameraWorld]) -> None:
+def test_a_person_is_mentioned_exactly_when_visible(office: tuple[Scenario, CameraWorld]) -> None:
     scenario, world = office
     tracer, rng = _tracer(scenario), np.random.default_rng(3)
     shown = hidden = 0
@@ -274,7 +274,7 @@ def _without(scene: Scene, label: str) -> CameraWorld:
 
 
 @pytest.mark.slow
-def test_the_goal_is_spoken_of_just_when_the_picture_shows_it(office: tuple[Scenario, CameraWorld]) -> None:
+def test_the_goal_is_mentioned_exactly_when_visible(office: tuple[Scenario, CameraWorld]) -> None:
     scenario, world = office
     tracer, route = _tracer(scenario), scenario.route
     thing = next(thing for thing in scenario.scene.objects if thing.label == route.goal_label)

@@ -96,12 +96,12 @@ def test_a_plan_into_a_wall_is_pushed_out_of_it(walls: Walls) -> None:
 
 @pytest.mark.slow
 @given(heading=st.floats(-1.2, 1.2), metres=st.floats(0.1, 3.0))
-def test_what_the_expert_does_costs_nothing(walls: Walls, heading: float, metres: float) -> None:
+def test_the_experts_plan_has_no_wall_cost(walls: Walls, heading: float, metres: float) -> None:
     plan = straight(heading, metres)
     assert too_near(plan, plan, KNOWN, *around(walls), 0.2).item() == 0
 
 
-def test_steps_whose_label_is_not_known_cost_nothing(walls: Walls) -> None:
+def test_steps_without_a_label_have_no_wall_cost(walls: Walls) -> None:
     known = KNOWN.clone()
     known[:, 5:] = False
     plan = straight(0.8)
@@ -140,7 +140,7 @@ def drawn(frames: DriveFrames, tmp_path: Path) -> Group:
     return samples.draw(np.random.default_rng(1))
 
 
-def test_samples_carry_walls_where_these_are_looked_at(tmp_path: Path) -> None:
+def test_samples_have_walls_where_the_loss_uses_them(tmp_path: Path) -> None:
     drive = in_corridor()
     weights = SampleConfig().weights
     without = drawn(DriveFrames.of(drive, 30, weights), tmp_path / "a")
@@ -151,7 +151,7 @@ def test_samples_carry_walls_where_these_are_looked_at(tmp_path: Path) -> None:
         collate([without, given_], CPU)
 
 
-def test_a_plan_that_leads_into_walls_is_told_from_one_that_follows_the_expert(tmp_path: Path, walls: Walls) -> None:
+def test_a_plan_into_walls_differs_in_loss_from_one_that_follows_the_expert(tmp_path: Path, walls: Walls) -> None:
     batch = collate([drawn(DriveFrames.of(in_corridor(), 30, SampleConfig().weights, walls), tmp_path)], CPU)
     batch = dataclasses.replace(batch, target=straight(-0.3).expand(4, -1, -1), known=KNOWN.expand(4, -1))
     assert batch.around is not None
@@ -165,7 +165,7 @@ def test_a_plan_that_leads_into_walls_is_told_from_one_that_follows_the_expert(t
 
 
 @pytest.mark.slow
-def test_imitation_tells_how_often_plans_lead_into_walls(tmp_path: Path) -> None:
+def test_imitation_reports_how_often_plans_lead_into_walls(tmp_path: Path) -> None:
     held = side_drive("left-v", VAL_LAYOUT, scene=f"office-{VAL_LAYOUT}")
     held = dataclasses.replace(held, pose=held.pose * (1.0, 0.3, 1.0) + np.array((20.5, 7.0, 0.0)))
     assert SCENES.along(held) is not None

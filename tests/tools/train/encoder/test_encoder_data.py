@@ -62,7 +62,7 @@ def test_held_out_layouts_are_never_learned_from_however_often_one_is_tried_agai
     assert tried[True] and tried[False] and not tried[True] & tried[False]
 
 
-def test_no_layout_is_the_benchmarks_or_one_that_drives_are_recorded_in() -> None:
+def test_no_layout_is_the_benchmarks_or_a_recorded_drives() -> None:
     highest = scenarios.RESERVED_BELOW + (scenarios.MAX_SEED + 1) * scenarios.LAYOUT_TRIES * scenarios.GROUPS
     for seed in (0, 1, 999, 2**31 - 1):
         for shard in plan(FramesConfig(count=3_000, held=500), seed, 8):
@@ -102,7 +102,7 @@ def test_a_shards_key_changes_with_every_number(shards: list[Shard]) -> None:
 
 
 @pytest.mark.slow
-def test_what_processes_have_made_can_be_read_as_one_list(filled: Path, shards: list[Shard]) -> None:
+def test_shards_of_several_processes_are_read_as_one_list(filled: Path, shards: list[Shard]) -> None:
     frames = FrameSet(filled, shards)
     assert len(frames) == 24
     for name, (kind, shape) in label_shapes(8).items():
@@ -138,7 +138,7 @@ def test_only_a_whole_file_of_the_same_numbers_counts(tmp_path: Path, shards: li
     assert made(tmp_path, shard) is None
 
 
-def test_making_pictures_ends_when_it_is_told_to(tmp_path: Path, shards: list[Shard]) -> None:
+def test_picture_generation_ends_on_request(tmp_path: Path, shards: list[Shard]) -> None:
     with pytest.raises(KeyboardInterrupt):
         fill(tmp_path, shards, 1, QuietProgress(), lambda: True)
 

@@ -65,7 +65,7 @@ def costs(heads: EncoderHeads, labels: Mapping[str, Any], seen: torch.Tensor) ->
     return losses(heads(seen), as_tensors(labels, "cpu"), Balance.of(some_labels(40)))
 
 
-def test_a_cell_is_told_from_its_own_token_and_a_column_from_its_own_column(heads: EncoderHeads) -> None:
+def test_a_cell_depends_on_its_own_token_and_a_column_on_its_own_column(heads: EncoderHeads) -> None:
     before, row, column = tokens(1), 1, 2
     after = before.clone()
     after[0, row * SIDE + column] += torch.linspace(-1, 1, DIM)
@@ -96,7 +96,7 @@ def test_a_batchs_loss_is_the_mean_of_its_pictures_losses(heads: EncoderHeads) -
         assert alone[0].item() == pytest.approx(together[i].item(), rel=1e-5)
 
 
-def test_what_has_no_colour_no_heading_no_thing_or_no_opening_teaches_nothing_of_it(heads: EncoderHeads) -> None:
+def test_missing_labels_have_no_loss(heads: EncoderHeads) -> None:
     labels = some_labels(2)
     labels["colour"][:], labels["facing"][:], labels["rank"][:], labels["open_kind"][:] = NONE, NONE, 0, 0
     found = costs(heads, labels, tokens(2))
@@ -135,7 +135,7 @@ def with_machine(column: int, count: int = 4) -> dict[str, np.ndarray]:
     return labels
 
 
-def test_whoever_is_right_has_a_full_score() -> None:
+def test_correct_outputs_have_a_full_score() -> None:
     labels = some_labels(30, side=WIDE)
     found = scored(right(labels), labels)
     for name in (
@@ -155,7 +155,7 @@ def test_a_landmark_is_found_where_it_stands_and_not_beside_it(said: int, found:
     assert scored(right(with_machine(said)), with_machine(2))["landmark_bearing"] == found
 
 
-def test_missed_and_imagined_people_are_told_apart() -> None:
+def test_missed_and_imagined_people_are_counted_separately() -> None:
     labels = with_machine(3)
     labels["thing"][:, 6:, :2] = PERSON
     said = right(labels)

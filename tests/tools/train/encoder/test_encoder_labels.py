@@ -177,9 +177,7 @@ def test_beside_the_way_the_floor_ends_at_the_wall(twin: IdWorld, grid: NavGrid)
 
 
 @pytest.mark.parametrize(("heading", "octant"), [(0.0, 0), (pi / 2, 2), (pi, 4), (-pi / 2, 6)])
-def test_a_persons_heading_is_told_as_the_camera_sees_it(
-    twin: IdWorld, grid: NavGrid, heading: float, octant: int
-) -> None:
+def test_a_persons_heading_is_relative_to_the_camera(twin: IdWorld, grid: NavGrid, heading: float, octant: int) -> None:
     for turn in (0.0, 0.5):
         where = (3.0 * np.cos(turn), 3.0 * np.sin(turn) * 0.4, heading)
         found = labelled(twin, grid, state(where, turn=turn * 0.4))

@@ -21,11 +21,7 @@ from tools.train.config.imitate import POINT_GOAL, ImitateConfig, ImitateEvalCon
 from tools.train.drives.drive import Dataset
 from tools.train.imitate.data import NoStates
 from tools.train.imitate.imitate import POINT_GOAL_FILE, fit, run
-from tools.train.imitate.trainable_policies import (
-    PointGoalNetPolicy,
-    build_point_goal,
-    load_point_goal,
-)
+from tools.train.imitate.trainable_policies import PointGoalNetPolicy, build_point_goal, load_point_goal
 from tools.train.pipeline.chain import Step, run_step
 from tools.train.run import distributed
 from tools.train.run.job import StageJob
@@ -62,7 +58,7 @@ def run_of(dataset: Dataset, job: StageJob) -> Run:
 
 
 @pytest.mark.slow
-def test_it_learns_to_drive_by_what_it_is_told_in_places_it_has_not_seen(tmp_path: Path, dataset: Dataset) -> None:
+def test_it_learns_to_follow_the_semantic_state_in_unseen_layouts(tmp_path: Path, dataset: Dataset) -> None:
     job = imitate_job(tmp_path, LONG)
     _, result = trained(dataset, job)
     lines = list(job.run_dir.lines())

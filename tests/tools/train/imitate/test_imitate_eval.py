@@ -40,7 +40,7 @@ def test_keeping_the_state_is_driving_on_along_its_arc() -> None:
     assert not plans[3].any()
 
 
-def test_driving_to_waypoints_is_being_there_when_they_say() -> None:
+def test_driving_to_waypoints_arrives_at_their_times() -> None:
     points = np.array([(-0.5, 0.0), (1.0, 1.0), (1.0, 4.0)])
     plan = to_waypoints(points, 4.0, 50)
     # The first one's time, 3 s, is over; the second is to be reached in 2 s, the third in 5 s.
@@ -62,7 +62,7 @@ def test_a_policy_that_plans_as_the_expert_does_makes_no_error(samples: Samples)
     assert kept["fde_m"]["3s"] > 0.05 and straight["fde_m"]["3s"] > 0.01
 
 
-def test_ages_are_told_apart_and_add_up(samples: Samples) -> None:
+def test_errors_are_listed_by_age_and_add_up(samples: Samples) -> None:
     result = evaluate(lambda batch: batch.target, samples, FEW, seed=1, device=CPU)
     bins = result["by_delay"]
     assert [(each["from_s"], each["to_s"]) for each in bins] == [(0, 1), (1, 2), (2, 3), (3, 5), (5, 7), (7, 10)]
@@ -81,7 +81,7 @@ def test_ages_are_told_apart_and_add_up(samples: Samples) -> None:
         assert each["policy"]["samples"] == count
 
 
-def test_a_policy_loses_by_others_words_what_it_had_by_its_own(samples: Samples) -> None:
+def test_another_drives_states_increase_the_error(samples: Samples) -> None:
     def by_words(batch: ActionBatch) -> torch.Tensor:
         """Goes to the side that it is told; what it is told of its own drive is always right."""
         side = torch.sign(batch.guidance[:, -1, 0]).repeat_interleave(len(batch) // len(batch.guidance))

@@ -168,7 +168,7 @@ def chance_of_frames(samples: Samples, count: int) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_every_frame_with_a_label_is_drawn_as_often_whatever_its_age_may_be(dataset: Dataset) -> None:
+def test_every_frame_with_a_label_is_drawn_equally_often_at_every_age(dataset: Dataset) -> None:
     samples = of(dataset, SampleConfig(group=8, standing_start=0.5, weights=EVEN))
     seen = chance_of_frames(samples, 4000)
     known = samples.drives[0].known >= LEAST_KNOWN
@@ -197,7 +197,7 @@ def test_frames_near_turns_goals_and_people_are_drawn_more_often(tmp_path: Path)
     np.testing.assert_allclose(DriveFrames.of(policys, 30, config).weight, 11.0 * weight)
 
 
-def test_frames_of_one_that_stands_and_should_not_are_drawn_more_often() -> None:
+def test_frames_of_a_robot_that_stands_against_its_label_are_drawn_more_often() -> None:
     drive = side_drive("left-a")
     state, future = drive.state.copy(), drive.future.copy()
     state[:], future[:] = (0.5, 0.0, 0.0), 0.0
@@ -227,7 +227,7 @@ def test_a_robot_that_stands_in_its_first_frame_has_stood_there_before(dataset: 
     assert stood > 50
 
 
-def test_one_that_moves_there_has_not(tmp_path: Path) -> None:
+def test_a_robot_that_moves_in_its_first_frame_keeps_its_age(tmp_path: Path) -> None:
     dataset = write_dataset(tmp_path, [side_drive("left-a", start_mps=0.5)])
     samples = of(dataset, dataclasses.replace(PLAIN, standing_start=1.0))
     for chosen, _ in drawn(samples, 100):
@@ -242,7 +242,7 @@ def test_without_injected_delay_every_state_is_of_its_frame(dataset: Dataset) ->
         assert np.abs(group.latency).max() < 1e-12
 
 
-def test_tokens_and_states_are_dropped_as_often_as_the_network_says(dataset: Dataset) -> None:
+def test_tokens_and_states_are_dropped_at_the_networks_rates(dataset: Dataset) -> None:
     found = drawn(of(dataset, drop=True), 400)
     kept = np.concatenate([group.keep_guidance.ravel() for _, group in found])
     states = np.concatenate([group.keep_state for _, group in found])
@@ -303,7 +303,7 @@ def test_states_without_waypoints_cannot_guide_by_them(dataset: Dataset) -> None
     assert {chosen.anchor % 20 for chosen, _ in drawn(samples, 60)} == {0}
 
 
-def test_nothing_to_draw_is_said(tmp_path: Path, dataset: Dataset) -> None:
+def test_a_data_set_without_frames_is_refused(tmp_path: Path, dataset: Dataset) -> None:
     class Nobody(SideStates):
         def anchors(self, drive_id: str) -> tuple[int, ...]:
             return ()
@@ -317,7 +317,7 @@ def test_nothing_to_draw_is_said(tmp_path: Path, dataset: Dataset) -> None:
         DriveFrames.of(dataset.load("left-a", pictures=False), 51, EVEN)
 
 
-def test_a_label_that_backs_off_stands_and_turns_as_the_expert_does() -> None:
+def test_a_label_that_backs_off_becomes_a_turn_on_the_spot() -> None:
     drive = side_drive("left-a")
     future = drive.future.copy()
     future[7] = np.arange(1, 51)[:, None] * np.array((-0.02, -0.005, 0.04))

@@ -113,7 +113,7 @@ def test_every_instant_has_the_newest_picture_that_was_there_by_then(recording: 
     assert ages.min() > -2e-5 and ages.max() < 1 / PICTURE_HZ + 1e-5
 
 
-def test_the_state_is_of_the_tenth_before_and_knows_nothing_of_what_comes(recording: Recording) -> None:
+def test_the_state_is_of_the_tenth_before_and_independent_of_later_motion(recording: Recording) -> None:
     (piece,) = pieces(recording)
     assert np.allclose(piece.state, (SPEED_MPS, 0.0, TURN_RADPS), atol=0.02)
 
@@ -186,7 +186,7 @@ TRACE = {
 }
 
 
-def test_words_are_given_to_the_episode_that_they_are_of(tmp_path: Path) -> None:
+def test_an_instruction_belongs_to_its_own_episode(tmp_path: Path) -> None:
     texts = {"1": {"wordings": ["follow the path", "go along the path"], "traces": [TRACE] * 20}}
     first, second = drives(read_scand(_scand(tmp_path / "A", 41.0, texts)), "scand", "spot")
     assert first.wordings == () and first.traces == ()
@@ -196,7 +196,7 @@ def test_words_are_given_to_the_episode_that_they_are_of(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("texts", "says"),
+    ("texts", "message"),
     [
         ({"7": {"wordings": ["go"]}}, "texts for episode 7; expected a number below 1"),
         ({"0": {"wordings": ["go"], "traces": [TRACE]}}, "expected 20 traces"),
@@ -207,8 +207,8 @@ def test_words_are_given_to_the_episode_that_they_are_of(tmp_path: Path) -> None
         ({"first": {"wordings": ["go"]}}, "number of an episode"),
     ],
 )
-def test_words_that_cannot_be_are_refused(tmp_path: Path, texts: Mapping[str, Any], says: str) -> None:
-    with pytest.raises(TrainError, match=says):
+def test_invalid_instructions_are_refused(tmp_path: Path, texts: Mapping[str, Any], message: str) -> None:
+    with pytest.raises(TrainError, match=message):
         list(drives(read_scand(_scand(tmp_path / "A", 21.0, texts)), "scand", "spot"))
 
 
@@ -216,16 +216,16 @@ def test_words_that_cannot_be_are_refused(tmp_path: Path, texts: Mapping[str, An
 
 
 @pytest.mark.parametrize(
-    ("rows", "says"),
+    ("rows", "message"),
     [
         ("stamp_ns,x_m,y_m\n1,2,3\n", "column theta_rad is missing"),
         ("stamp_ns,x_m,y_m,theta_rad\n1,2,north,3\n", "not of numbers"),
     ],
 )
-def test_odometry_that_cannot_be_is_refused(tmp_path: Path, rows: str, says: str) -> None:
+def test_odometry_that_cannot_be_is_refused(tmp_path: Path, rows: str, message: str) -> None:
     folder = _scand(tmp_path / "A", 1.0)
     (folder / "odometry.csv").write_text(rows)
-    with pytest.raises(TrainError, match=says):
+    with pytest.raises(TrainError, match=message):
         read_scand(folder)
 
 
@@ -282,7 +282,7 @@ def test_a_folder_of_recordings_becomes_a_data_set(tmp_path: Path) -> None:
     assert (result["recordings"], result["drives"], result["sha256"]) == (2, 2, found.sha256)
 
 
-def test_the_command_says_in_one_line_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_reports_an_error_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["gnd", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and "found no recording of gnd" in said

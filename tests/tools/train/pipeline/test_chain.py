@@ -85,7 +85,7 @@ def test_all_goes_through_every_stage_with_imitation_again_after_each_round() ->
     assert [step.name for step in steps_of("sft", recipe)] == ["sft"]
 
 
-def test_a_stage_that_was_begun_is_neither_written_over_nor_forgotten(run_dir: RunDir) -> None:
+def test_a_stage_that_was_begun_is_neither_overwritten_nor_skipped(run_dir: RunDir) -> None:
     (run_dir.stage("sft") / "checkpoint").touch()
     with pytest.raises(TrainError, match="--resume"):
         may_begin(run_dir, Step("sft"), resume=False)
@@ -127,9 +127,7 @@ DEAF = ("action.latency_aware", "action.motion_offset")
 
 
 @pytest.mark.parametrize("to", DEAF)
-def test_an_ablation_of_what_is_heard_goes_on_from_weights_that_heard_it(
-    run_dir: RunDir, tmp_path: Path, to: str
-) -> None:
+def test_an_ablation_of_an_input_starts_from_weights_with_that_input(run_dir: RunDir, tmp_path: Path, to: str) -> None:
     save_weights(build(TINY.model, 7), tmp_path / "w.safetensors", WeightsInfo(True, "elsewhere"))
     deaf = replace(TINY, model=with_overrides(TINY.model, {to: "false"}))
     import_start(run_dir.out, deaf.model, [tmp_path / "w.safetensors"], 1)
@@ -175,23 +173,23 @@ def test_a_run_goes_on_from_the_weights_that_a_round_left_elsewhere(
 
 
 @pytest.mark.parametrize(
-    ("after", "recipe", "says"),
+    ("after", "recipe", "message"),
     [("sft", NEWEST, "expected one of imitate, imitate-1"), ("imitate", TINY, "set dagger.newest_only=true")],
 )
-def test_weights_are_adopted_only_where_all_that_follows_is_possible(after: str, recipe: Recipe, says: str) -> None:
-    with pytest.raises(TrainError, match=says):
+def test_weights_are_adopted_only_where_all_later_steps_are_possible(after: str, recipe: Recipe, message: str) -> None:
+    with pytest.raises(TrainError, match=message):
         steps_until(after, recipe, steps_of("all", recipe))
 
 
 # Export in between
 
 
-def command(tmp_path: Path, code: int, says: str = "") -> list[str]:
+def command(tmp_path: Path, code: int, message: str = "") -> list[str]:
     """An `edge-export` that writes down what it is asked, and ends."""
     script = tmp_path / "export.sh"
     lines = (
         f'echo "$@" >> {tmp_path}/asked',
-        f'echo "{says}"',
+        f'echo "{message}"',
         'mkdir -p "${@: -1}"',
         'touch "${@: -1}/manifest.json"',
         f"exit {code}",
@@ -210,7 +208,7 @@ def test_weights_are_exported_once(tmp_path: Path) -> None:
         assert len(asked) == times and f"--checkpoint {weights}" in asked[-1] and "--model nano" in asked[-1]
 
 
-def test_an_export_that_fails_says_its_last_line(tmp_path: Path) -> None:
+def test_a_failed_export_reports_its_last_line(tmp_path: Path) -> None:
     (tmp_path / "w").write_bytes(b"1")
     with pytest.raises(ExportError, match="ended with 1: cosine too low"):
         export_artifacts(
@@ -244,15 +242,15 @@ def test_stages_are_run_one_by_one_into_one_folder(tmp_path: Path, stages: None,
     assert "sft: done before" in capsys.readouterr().err
 
 
-def test_a_dry_run_says_what_would_be_done_and_leaves_nothing(tmp_path: Path, capsys: Any) -> None:
+def test_a_dry_run_prints_the_steps_and_writes_nothing(tmp_path: Path, capsys: Any) -> None:
     assert run("all", "--preset", "tiny", "--out", tmp_path / "run", "--dry-run", "--json", "-") == EXIT_DONE
-    told = capsys.readouterr()
-    assert "dagger-1" in told.err and "  total " in told.err and not (tmp_path / "run").exists()
-    assert json.loads(told.out)["budget"]
+    printed = capsys.readouterr()
+    assert "dagger-1" in printed.err and "  total " in printed.err and not (tmp_path / "run").exists()
+    assert json.loads(printed.out)["budget"]
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         (("sft",), "--out is missing"),
         (("sft", "--preset", "nono", "--out", "x"), "expected one of 1b, nano, tiny"),
@@ -266,13 +264,13 @@ def test_a_dry_run_says_what_would_be_done_and_leaves_nothing(tmp_path: Path, ca
         (("card", "--out", "x"), "the folder of a run"),
     ],
 )
-def test_what_makes_no_sense_is_one_line(
-    arguments: tuple[str, ...], says: str, capsys: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_invalid_arguments_are_refused_in_one_line(
+    arguments: tuple[str, ...], message: str, capsys: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert run(*arguments) == EXIT_BAD_INPUT
-    told = capsys.readouterr().err
-    assert says in told and told.count("\n") == 1 and not list(tmp_path.iterdir())
+    printed = capsys.readouterr().err
+    assert message in printed and printed.count("\n") == 1 and not list(tmp_path.iterdir())
 
 
 def test_a_run_keeps_its_own_copy_of_a_devices_delays(
@@ -319,7 +317,7 @@ def test_a_stage_that_cannot_go_on_ends_with_its_code_and_a_line(
     assert "Traceback" not in capsys.readouterr().err and RunDir(tmp_path / "run").result("sft") is None
 
 
-def test_a_bug_is_not_dressed_up_as_bad_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bug_is_not_reported_as_bad_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     use(monkeypatch, raising(ValueError("shapes do not match")))
     with pytest.raises(ValueError, match="shapes"):
         run("sft", "--preset", "tiny", "--out", tmp_path / "run")
@@ -349,7 +347,7 @@ def trained(run_dir: RunDir) -> RunDir:
     return run_dir
 
 
-def test_the_card_says_what_it_is_made_of_and_how_well_it_does(trained: RunDir, tmp_path: Path) -> None:
+def test_the_card_names_its_data_and_its_scores(trained: RunDir, tmp_path: Path) -> None:
     scores = tmp_path / "result.json"
     conditions = {"clock": "lockstep", "mode": "async", "drift": "none"}
     latency = {"profile": "2 s"}
@@ -364,7 +362,7 @@ def test_the_card_says_what_it_is_made_of_and_how_well_it_does(trained: RunDir, 
     assert card(trained, TINY, trained.model_path) == card(trained, TINY, trained.model_path)
 
 
-def test_scores_of_something_else_are_refused(trained: RunDir, tmp_path: Path) -> None:
+def test_a_file_that_is_no_benchmark_result_is_refused(trained: RunDir, tmp_path: Path) -> None:
     (tmp_path / "other.json").write_text("{}")
     with pytest.raises(TrainError, match=r"result.json of edge-bench"):
         write_card(trained, TINY, [tmp_path / "other.json"])
@@ -381,9 +379,7 @@ def test_weights_that_are_given_away_are_half_the_size_and_the_default_of_their_
 
 
 @pytest.mark.parametrize("text", [None, b"# Somebody's weights", b"\xff\xfe"])
-def test_weights_without_a_card_of_their_own_are_those_of_others(
-    run_dir: RunDir, tmp_path: Path, text: bytes | None
-) -> None:
+def test_weights_without_a_card_are_foreign(run_dir: RunDir, tmp_path: Path, text: bytes | None) -> None:
     if text is not None:
         (tmp_path / "w.md").write_bytes(text)
     adopted(run_dir, tmp_path, "imitate")

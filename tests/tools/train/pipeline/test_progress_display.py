@@ -31,10 +31,10 @@ def test_curves_are_drawn_of_every_stage_that_has_more_than_a_point(run_dir: Run
     assert (run_dir.curves / "sft.png").read_bytes() == first
 
 
-def test_the_budget_adds_up_what_was_measured_and_names_what_was_not() -> None:
+def test_the_budget_adds_up_measured_times_and_names_missing_ones() -> None:
     steps = steps_of("all", TINY)
-    told = lines_of(TINY, steps, [Line("sft", "anchors", 5400, 54.0), Line("rl", "steps", 9, None)], "cpu")
-    assert "1 min 40 s" in told[-1] and "1 parts without a measured rate" in told[-1]
+    printed = lines_of(TINY, steps, [Line("sft", "anchors", 5400, 54.0), Line("rl", "steps", 9, None)], "cpu")
+    assert "1 min 40 s" in printed[-1] and "1 parts without a measured rate" in printed[-1]
     assert {line.step for line in budget_of(TINY, steps, "cpu")} >= {"dagger-1", "evaluate"}
 
 

@@ -84,7 +84,7 @@ def test_every_iteration_is_logged_and_evaluations_in_between(tmp_path: Path) ->
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("last", "gained"), [(True, 1.0), (False, 0.0)])
-def test_what_was_gained_is_the_last_evaluation_less_the_first_with_an_interval(
+def test_the_gain_is_the_last_evaluation_less_the_first_with_an_interval(
     last: bool, gained: float, tmp_path: Path
 ) -> None:
     config = RlConfig(iterations=4, evaluate_every=2, warmup_iterations=0, ppo=PPO)

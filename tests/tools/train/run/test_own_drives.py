@@ -93,12 +93,12 @@ def test_the_card_does_not_call_them_ours(run_dir: RunDir, theirs: Dataset, tmp_
 
 def test_a_plan_with_their_drives_collects_nothing(theirs: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["all", "--preset", "tiny", "--drives", str(theirs.folder), "--dry-run"]) == 0
-    told = capsys.readouterr().err
-    assert "sft" in told and "collect" not in told
+    printed = capsys.readouterr().err
+    assert "sft" in printed and "collect" not in printed
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         (("sft", "--from", "b"), "both name the drives"),
         (("all", "--checkpoint", "w", "--after", "imitate"), "continues without earlier drives"),
@@ -106,11 +106,11 @@ def test_a_plan_with_their_drives_collects_nothing(theirs: Dataset, capsys: pyte
         (("sft",), "not the index of a data set"),
     ],
 )
-def test_what_makes_no_sense_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], says: str
+def test_invalid_arguments_are_refused_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], message: str
 ) -> None:
     out = tmp_path / "c"
     RunDir.open(out, TINY)
     assert cli.main([*arguments, "--drives", str(tmp_path / "a"), "--out", str(out)]) == 2
-    told = capsys.readouterr().err
-    assert says in told and told.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert message in printed and printed.count("\n") == 1

@@ -19,14 +19,7 @@ from export.model.config import PRESETS
 from tools.train.config.checks import OptimConfig, TrainError
 from tools.train.config.recipe import load_recipe
 from tools.train.run.distributed import autocast, computes_bf16
-from tools.train.run.loop import (
-    Optimiser,
-    learning_rate,
-    load_checkpoint,
-    save_checkpoint,
-    under,
-    with_prefix,
-)
+from tools.train.run.loop import Optimiser, learning_rate, load_checkpoint, save_checkpoint, under, with_prefix
 from tools.train.run.run_dir import RunDir
 
 NANO = PRESETS["nano"]
@@ -40,14 +33,14 @@ def run_dir(tmp_path: Path, **changed: object) -> RunDir:
     return RunDir.open(tmp_path / "run", replace(load_recipe("tiny"), **changed))
 
 
-def test_a_run_says_what_it_was_made_with(tmp_path: Path) -> None:
+def test_a_run_records_its_versions(tmp_path: Path) -> None:
     made = run_dir(tmp_path)
     assert load_recipe(str(made.recipe_path)) == load_recipe("tiny")
     versions = json.loads((made.out / "versions.json").read_text())
     assert versions["packages"]["numpy"] == np.__version__ and versions["python"]
 
 
-def test_a_run_that_goes_on_with_other_code_says_so_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_that_continues_with_other_code_reports_it_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = run_dir(tmp_path)
     first = json.loads((made.out / "versions.json").read_text())
     run_dir(tmp_path)
@@ -79,7 +72,7 @@ def test_seed_and_network_of_a_run_are_fixed_by_its_first_stage(setting: str, tm
         RunDir.open(made.out, load_recipe("tiny"))
 
 
-def test_somebody_elses_folder_is_not_taken(tmp_path: Path) -> None:
+def test_a_foreign_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "letters").mkdir()
     (tmp_path / "letters" / "to-mother.txt").touch()
     with pytest.raises(TrainError, match="new or empty directory"):
@@ -97,7 +90,7 @@ def test_a_resumed_stage_writes_its_lines_again_and_only_its_own(tmp_path: Path)
     ]  # fmt: skip
 
 
-def test_what_a_stage_left_is_kept_under_another_name(tmp_path: Path) -> None:
+def test_a_retired_stages_files_are_kept_under_another_name(tmp_path: Path) -> None:
     made = run_dir(tmp_path)
     made.finish("imitate", {"loss": 1.0})
     made.log("imitate", 1, loss=1.0)
@@ -273,7 +266,7 @@ def test_two_processes_share_the_stages_that_can_be_shared_and_the_first_does_th
 
 
 @pytest.mark.slow
-def test_processes_stop_together_where_one_is_asked_to_and_go_on_together(tmp_path: Path) -> None:
+def test_processes_stop_together_on_one_request_and_go_on_together(tmp_path: Path) -> None:
     assert codes(two_ranks("tests.support.train.train_chain_rank", str(tmp_path), "stop")) == [EXIT_INTERRUPTED] * 2
     before = [(tmp_path / f"{rank}.txt").read_text().split() for rank in range(2)]
     assert before[0][-3] == before[1][-3] == "encoder"
@@ -297,7 +290,7 @@ def test_where_the_first_process_fails_at_its_own_work_the_others_end_with_it(tm
 
 
 @pytest.mark.slow
-def test_run_as_a_module_it_says_what_is_wrong_in_one_line() -> None:
+def test_run_as_a_module_it_reports_an_error_in_one_line() -> None:
     command = [sys.executable, "-m", "tools.train.cli", "all", "--preset", "nope", "--out", "never"]
     ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert ended.returncode == EXIT_BAD_INPUT

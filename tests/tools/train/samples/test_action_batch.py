@@ -138,7 +138,7 @@ def test_the_loss_is_smooth_l1_over_the_known_steps() -> None:
 
 
 @pytest.mark.parametrize("head", ["query", "diffusion", "flow"])
-def test_what_every_head_makes_small_is_about_its_own_frame(head: str) -> None:
+def test_the_error_of_every_head_is_per_frame_and_reaches_its_weights(head: str) -> None:
     config = model_with(head=head)
     action = expert(config)
     one = group(3, 4, config)

@@ -150,7 +150,7 @@ def test_waypoints_alone_are_asked_for_by_beginning_the_answer(prompts: Prompts,
     assert (*begun[len(whole) :], *rest[:-1]) == tuple(last_line)
 
 
-def test_before_is_what_was_true_when_the_last_generation_looked(anchors: dict[int, Anchor]) -> None:
+def test_the_progress_before_is_that_of_the_last_generations_anchor(anchors: dict[int, Anchor]) -> None:
     assert anchors[0].before(0.3) is None
     assert anchors[100].before(0.5) == progress_at(90)
     assert anchors[100].before(1.5) == progress_at(80)
@@ -158,7 +158,7 @@ def test_before_is_what_was_true_when_the_last_generation_looked(anchors: dict[i
     assert anchors[100].before(10.1) is None
 
 
-def test_wrong_words_are_as_rare_as_told_and_always_wrong(anchors: dict[int, Anchor]) -> None:
+def test_wrong_progress_has_the_given_share_and_is_always_wrong(anchors: dict[int, Anchor]) -> None:
     config = DrawConfig(before_min_s=1.0, before_max_s=1.0, before_late=0.0, before_wrong=0.2, waypoints_only=0.3)
     rng = np.random.default_rng(0)
     drawn = [draw(anchors[60], config, rng) for _ in range(2000)]
@@ -171,18 +171,18 @@ def test_wrong_words_are_as_rare_as_told_and_always_wrong(anchors: dict[int, Anc
     assert {each.wording for each in drawn} == set(WORDINGS)
 
 
-def test_the_way_is_told_as_another_odometry_would(anchors: dict[int, Anchor]) -> None:
+def test_past_motion_matches_that_of_another_odometry_origin(anchors: dict[int, Anchor]) -> None:
     config, rng = DrawConfig(way_point_m=0.0), np.random.default_rng(0)
     recorded = np.array(anchors[100].way)
-    told = np.array([draw(anchors[100], config, rng).way for _ in range(400)])
-    assert np.allclose(told, np.round(told, 1))
-    assert np.hypot(*(told - recorded).T).max() < 0.15 * np.hypot(*recorded.T).max() + 0.1
-    assert np.allclose(told.mean(0), recorded, atol=0.1) and told.std(0).max() > 0.02
+    paths = np.array([draw(anchors[100], config, rng).way for _ in range(400)])
+    assert np.allclose(paths, np.round(paths, 1))
+    assert np.hypot(*(paths - recorded).T).max() < 0.15 * np.hypot(*recorded.T).max() + 0.1
+    assert np.allclose(paths.mean(0), recorded, atol=0.1) and paths.std(0).max() > 0.02
     exact = DrawConfig(way_turn_rad=0.0, way_scale=0.0, way_point_m=0.0)
     assert draw(anchors[100], exact, rng).way == anchors[100].way
 
 
-def test_a_robot_that_waits_has_said_it_before_and_sees_one_place(anchors: dict[int, Anchor]) -> None:
+def test_a_waiting_robot_has_repeated_progress_and_one_place(anchors: dict[int, Anchor]) -> None:
     waited = waiting(anchors[0], 2)
     assert waited.frames == (0, 0) and waited.before(2.0) == anchors[0].progress
     assert draw(waited, DrawConfig(), np.random.default_rng(0)).way == anchors[0].way

@@ -167,7 +167,7 @@ def test_samples_of_the_mirror_are_as_many_as_asked_for_and_of_whole_seconds(dat
 
 
 @pytest.mark.slow
-def test_a_run_learns_from_the_mirror_if_it_is_told_to(tmp_path: Path) -> None:
+def test_a_run_learns_from_mirrored_samples_where_the_recipe_enables_it(tmp_path: Path) -> None:
     losses = []
     for share in (0.0, 0.5):
         side_dataset(tmp_path / f"{share}" / "collect")

@@ -48,7 +48,7 @@ def test_jpeg_comes_back_as_the_picture_in_the_same_colours() -> None:
     assert off.mean() < np.abs(through_jpeg(picture(), 10).astype(int) - picture()).mean()
 
 
-def test_what_is_no_jpeg_is_refused() -> None:
+def test_data_that_is_not_jpeg_is_refused() -> None:
     with pytest.raises(ValueError, match="expected a JPEG"):
         decoded(np.zeros(10, np.uint8))
 
@@ -75,7 +75,7 @@ def test_the_newest_frame_is_any_of_those_around_and_its_waypoints_are_its_own(a
         )
 
 
-def test_the_way_is_told_in_the_frame_that_is_shown(anchors: list[Anchor]) -> None:
+def test_past_motion_is_in_the_frame_of_the_shown_picture(anchors: list[Anchor]) -> None:
     recorded, anchor = drive(frames=150), anchors[11]
     for each in drawn(anchor, ShowConfig()):
         T_shown_anchor = recorded.T_odom_base(each.k).inverse() @ recorded.T_odom_base(anchor.k)

@@ -95,7 +95,7 @@ def test_a_state_with_its_own_text_is_of_that_text(
         np.testing.assert_allclose(state.kv[:upto], truth.kv[:upto], atol=ROUNDING)
 
 
-def test_a_policys_drive_has_a_share_of_its_own_words_for_itself(tmp_path: Path, network: TicVla) -> None:
+def test_a_policys_drive_has_a_share_of_its_own_texts(tmp_path: Path, network: TicVla) -> None:
     drives = [made_up_drive("a", 40), made_up_drive("b", 40, driver="policy:0123")]
     theirs = dataclasses.replace(CONFIG, own_share=0.0, own_share_policy=1.0)
     dataset = write_dataset(tmp_path / "drives", drives)
@@ -117,7 +117,7 @@ def test_draws_of_an_anchor_differ_and_none_depends_on_how_many_there_are(
     assert any(a.shape != b.shape or not np.allclose(a, b, atol=ROUNDING) for a, b in pairs)
 
 
-def test_what_is_there_is_not_made_again_and_what_is_missing_is(
+def test_existing_states_are_kept_and_missing_ones_are_made(
     tmp_path: Path, cache: KvCache, network: TicVla, dataset: Dataset
 ) -> None:
     shutil.copytree(cache.folder, tmp_path / cache.folder.name)
@@ -131,9 +131,7 @@ def test_what_is_there_is_not_made_again_and_what_is_missing_is(
     np.testing.assert_array_equal(again.at("b", 10).kv, cache.at("b", 10).kv)
 
 
-def test_other_weights_other_words_and_another_drive_are_another_cache(
-    cache: KvCache, network: TicVla, dataset: Dataset
-) -> None:
+def test_other_weights_texts_or_drives_need_another_cache(cache: KvCache, network: TicVla, dataset: Dataset) -> None:
     key = cache_key(network, CONTENT, CONFIG, 3)
     assert cache.key == key
     assert cache_key(build(tiny_model(), 2), CONTENT, CONFIG, 3) != key

@@ -111,7 +111,7 @@ def test_greedy_answers_of_a_batch_are_those_of_every_row_alone(language: Langua
         )
 
 
-def test_a_row_is_held_to_its_guide_and_hears_what_it_was_made_to_say(language: LanguageModel) -> None:
+def test_a_row_follows_its_constraint_and_receives_the_constrained_tokens(language: LanguageModel) -> None:
     silent = [dataclasses.replace(one, answer=()) for one in ROWS[:2]]
     batch = collate(silent, img_context_id=IMAGE, device=DEVICE)
     free = decode(language, batch, 6)

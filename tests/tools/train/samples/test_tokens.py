@@ -47,7 +47,7 @@ def network() -> TicVla:
     return build(tiny_model(), 1)
 
 
-def test_tokens_are_what_the_encoder_makes_of_every_picture(dataset: Dataset, network: TicVla) -> None:
+def test_tokens_are_the_encoders_output_for_every_picture(dataset: Dataset, network: TicVla) -> None:
     cache = TokenCache(dataset, network.vision)
     assert cache.build(batch=3) == 2
     drive = dataset.load("a")

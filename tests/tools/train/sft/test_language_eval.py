@@ -33,7 +33,7 @@ def test_the_truth_is_right_in_everything(anchors: list[Anchor]) -> None:
     assert max(numbers["waypoint_error_m"]) < 0.08
 
 
-def test_changes_are_where_repeating_what_was_said_is_wrong(anchors: list[Anchor]) -> None:
+def test_changes_are_where_repeating_the_last_text_is_wrong(anchors: list[Anchor]) -> None:
     score = Score(2.0)
     for anchor in anchors:
         repeated = anchor.before(2.0) or anchor.progress
@@ -75,7 +75,7 @@ class Parrot:
         return [self.texts.pop(0) for _ in questions]
 
 
-def test_along_a_drive_the_model_hears_what_it_said_itself_last() -> None:
+def test_along_a_drive_the_prompt_has_the_models_own_last_progress() -> None:
     anchors = [*anchors_of(made_up_drive("a", 60)), *anchors_of(made_up_drive("b", 25))]
     says = [
         "Progress: turn 1 of 1, passed 4.",

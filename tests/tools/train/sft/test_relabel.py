@@ -56,7 +56,7 @@ KINDS = ("corridor", "office", "sidewalk")
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_told_of_its_own_way_a_drive_is_what_it_was(kind: str) -> None:
+def test_a_relabel_with_its_own_route_equals_the_drive(kind: str) -> None:
     scenario, drive, _ = _told(kind)
     own = relabel_along(drive, scenario, SPEED_MPS)
     assert own is not None and own.wordings == drive.wordings and own.told == drive.about.told
@@ -134,7 +134,7 @@ def test_past_a_turn_that_was_missed_it_turns_back_and_not_before() -> None:
 
 
 @pytest.mark.slow
-def test_only_where_nobody_is_near_is_anything_learned(tmp_path: Path) -> None:
+def test_only_frames_without_people_nearby_are_relabelled(tmp_path: Path) -> None:
     scenario, drive, _ = _told("corridor")
     crowded = drive_along(scenario, "b", motion=CROWDED)
     dataset = write_dataset(tmp_path, [drive, crowded])
@@ -164,7 +164,7 @@ def test_a_drive_without_traces_or_from_elsewhere_is_left_alone(tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_what_is_written_is_read_and_made_only_once(tmp_path: Path) -> None:
+def test_a_written_relabel_is_read_back_and_made_only_once(tmp_path: Path) -> None:
     _, drive, found = _told("corridor")
     dataset = write_dataset(tmp_path, [drive])
     relabels = InstructionRelabels(dataset, CONFIG, 1, SPEED_MPS)
@@ -182,7 +182,7 @@ def test_what_is_written_is_read_and_made_only_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", ["", "{", '{"drive_sha256": "0", "ways": []}', '{"ways": [{}]}', "[]"])
-def test_what_cannot_be_read_or_is_of_another_drive_is_made_again(tmp_path: Path, content: str) -> None:
+def test_an_unreadable_or_foreign_relabel_is_made_again(tmp_path: Path, content: str) -> None:
     dataset = write_dataset(tmp_path, [made_up_drive("a", kind="recorded")])
     relabels = InstructionRelabels(dataset, CONFIG, 1, SPEED_MPS)
     relabels.build(dataset.ids)
@@ -192,7 +192,7 @@ def test_what_cannot_be_read_or_is_of_another_drive_is_made_again(tmp_path: Path
     assert (relabels.folder / "a.json").read_text() == whole
 
 
-def test_asked_to_stop_it_ends_after_the_drive_and_keeps_what_is_made(tmp_path: Path) -> None:
+def test_a_stop_request_ends_it_after_the_drive_and_keeps_its_output(tmp_path: Path) -> None:
     dataset = write_dataset(tmp_path, [made_up_drive(name, kind="recorded") for name in "abc"])
     relabels = InstructionRelabels(dataset, CONFIG, 1, SPEED_MPS)
     with pytest.raises(KeyboardInterrupt):

@@ -54,7 +54,7 @@ def run_of(dataset: Dataset, job: StageJob) -> Run:
 
 
 @pytest.mark.slow
-def test_the_loss_falls_on_what_is_learned_and_on_what_is_held_out(tmp_path: Path, dataset: Dataset) -> None:
+def test_the_loss_falls_on_training_and_held_out_data(tmp_path: Path, dataset: Dataset) -> None:
     job = sft_job(tmp_path, dataclasses.replace(CONFIG, epochs=12, optim=OptimConfig(lr=1e-2, warmup_steps=0)))
     _, result = trained(dataset, job)
     lines = list(job.run_dir.lines())
