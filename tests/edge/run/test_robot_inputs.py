@@ -58,7 +58,7 @@ class Rig:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.bench = Bench()
         self.deaths: list[str] = []
-        monkeypatch.setattr(robot_inputs, "Go2Reader", FakeReader)
+        monkeypatch.setattr("firmware_bridge.unitree.client.Go2Reader", FakeReader)
         monkeypatch.setattr(robot_inputs, "time", SimpleNamespace(monotonic_ns=lambda: self.bench.now_ns))
         self.inputs = RobotInputs(
             load_robot_config(GO2_SIM), image_px=32, period_ns=PERIOD_NS, commanded=lambda: self.command,
