@@ -9,8 +9,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import onnxruntime as ort
-
 TENSORRT, CUDA, OPENVINO = "TensorrtExecutionProvider", "CUDAExecutionProvider", "OpenVINOExecutionProvider"
 _PACKAGES = {
     TENSORRT: ("tensorrt", "tensorrt-cu12", "tensorrt-cu13"),
@@ -51,8 +49,18 @@ def package_version(name: str) -> str | None:
         return None
 
 
+def _onnxruntime_version() -> str:
+    import onnxruntime as ort  # an extra
+
+    return str(ort.__version__)
+
+
 def available_providers() -> list[str]:
     """Return the execution providers of this ONNX Runtime."""
+    try:
+        import onnxruntime as ort  # an extra
+    except ModuleNotFoundError:
+        return []
     return list(ort.get_available_providers())
 
 
@@ -69,7 +77,7 @@ def read_device(
         architecture=platform.machine(),
         device=_device(provider, root) or "unknown",
         l4t=l4t_release(_text(root / "etc/nv_tegra_release")),
-        onnxruntime=str(ort.__version__),
+        onnxruntime=_onnxruntime_version(),
         provider_version=_provider_version(provider, root, version_of),
     )
 

@@ -34,7 +34,15 @@ LIBRARY_URL: Final = f"https://deb.debian.org/debian/pool/main/c/cyclonedds/cycl
 LIBRARY_SHA256: Final = "ac59ee08975cd25a1fb414ddeb0183fb8636b12d49cea80373013bea59465b43"  # Debian's Sources index
 PACKAGES: Final = ("cyclonedds-dev", "cyclonedds-tools", "python3-dev", "gcc", "libc6-dev")
 BUILD_PACKAGES: Final = ("cmake", "make", "gcc", "libc6-dev", "python3-dev")
-_CHECK: Final = "import cyclonedds.domain, importlib.metadata as m; print(m.version('cyclonedds'))"
+# The binding loads the C library twice, by its own path and by the linker's: two different ones cannot make a topic.
+_CHECK: Final = """
+import importlib.metadata, pathlib, cyclonedds.domain
+maps = pathlib.Path("/proc/self/maps").read_text().splitlines()
+libraries = sorted({line.split()[-1] for line in maps if "libddsc" in line})
+if len(libraries) > 1:
+    raise SystemExit(f"two C libraries are loaded, {' and '.join(libraries)}: remove the package of the system's one")
+print(importlib.metadata.version("cyclonedds"))
+"""
 _CHUNK_BYTES: Final = 1 << 20
 
 Run = Callable[[Sequence[str], Mapping[str, str]], tuple[int, str]]
@@ -115,7 +123,7 @@ def _install(args: argparse.Namespace, say: Say, system: System, command: Run) -
         return EXIT_DONE
     code, output = command([system.python, "-c", _CHECK], {})
     if code != 0:
-        raise BindingError(f"the binding is installed, but cannot be imported: {_last_line(output)}")
+        raise BindingError(f"the binding is installed, but does not work: {_last_line(output)}")
     say(f"cyclonedds {output.strip()} works")
     return EXIT_DONE
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-import onnxruntime as ort
 
 from edge.artifacts.files import ArtifactError
 from edge.artifacts.manifest import Artifacts, TensorContract
+
+if TYPE_CHECKING:
+    import onnxruntime as ort  # an extra: loaded where a graph is opened, so that the installer runs without it
 
 Array = npt.NDArray[np.generic]
 
@@ -40,6 +43,8 @@ class Interrupt:
     """
 
     def __init__(self) -> None:
+        import onnxruntime as ort
+
         self.options = ort.RunOptions()
         self.is_set = False
 
@@ -91,6 +96,8 @@ class Graph:
         cores: Collection[int] = (),
     ) -> None:
         """`cores`: cores of the session's worker threads; empty: those of the opening thread."""
+        import onnxruntime as ort
+
         contract = artifacts.graphs[name]
         options = ort.SessionOptions()
         options.intra_op_num_threads = threads or contract.session.threads or 1

@@ -65,7 +65,7 @@ def test_version_needs_none_of_the_extras(command: str) -> None:
 @pytest.mark.parametrize(
     ("command", "extra"),
     [
-        ("edge-run", "cpu"), ("edge-doctor", "cpu"), ("edge-calib", "cpu"), ("edge-export", "export"),
+        ("edge-run", "cpu"), ("edge-calib", "cpu"), ("edge-export", "export"),
         ("edge-hil", "sim"), ("edge-bench", "sim"), ("edge-soak", "sim"), ("edge-train", "train"),
     ],
 )  # fmt: skip
@@ -75,7 +75,7 @@ def test_a_missing_extra_is_one_line_that_names_it(command: str, extra: str) -> 
     assert done.stderr.count("\n") == 1 and f"pip install 'tic-vla-edge[{extra}]'" in done.stderr
 
 
-@pytest.mark.parametrize("command", ["edge-say", "edge-bridge"])
+@pytest.mark.parametrize("command", ["edge-say", "edge-bridge", "edge-install", "edge-doctor"])
 def test_help_works_in_the_base_install(command: str) -> None:
     done = base_only(command, "--help")
     assert done.returncode == 0 and "usage:" in done.stdout, done.stderr

@@ -31,7 +31,6 @@ from edge.core.cli import (
     write_result,
 )
 from edge.core.device import available_providers, package_version
-from edge.deploy.doctor import graphs as doctor_graphs
 from edge.deploy.doctor import machine as doctor_machine
 from edge.deploy.doctor import rights as doctor_rights
 from edge.deploy.doctor import robot as doctor_robot
@@ -247,6 +246,8 @@ def _graphs(args: argparse.Namespace, artifacts: Artifacts | None, plan: PlanFac
             return
         yield Check("engines", Level.OK, f"{folder}: this device's own")
         artifacts = engines.with_engines(artifacts, folder)
+    from edge.deploy.doctor import graphs as doctor_graphs  # needs ONNX Runtime
+
     placed = [doctor_graphs.profile_graph(artifacts, name) for name in artifacts.graphs]
     yield from placed
     if failed(placed):
@@ -258,6 +259,8 @@ def _graphs(args: argparse.Namespace, artifacts: Artifacts | None, plan: PlanFac
 
 
 def _tick(args: argparse.Namespace, artifacts: Artifacts, plan: PlanFacts | None) -> Check:
+    from edge.deploy.doctor import graphs as doctor_graphs  # needs ONNX Runtime
+
     prompt = artifacts.runtime.frame_tokens if plan is None else plan.prompt_tokens
     try:
         times_ms = doctor_graphs.measure_ticks(

@@ -33,6 +33,8 @@ def onnx_runtime(
     wanted = "onnxruntime-openvino" if OPENVINO in providers else "onnxruntime-gpu"
     accelerated = any(provider in (TENSORRT, CUDA, OPENVINO) for provider in providers)
     reinstall = f"pip install --force-reinstall {_source(wanted if accelerated else 'onnxruntime', machine)}"
+    if not available:
+        return Check(name, Level.FAIL, "the module onnxruntime is missing", expected, reinstall)
     if len(installed) > 1:
         names = " ".join(package.split()[0] for package in installed)
         return Check(name, Level.FAIL, found, expected, f"pip uninstall -y {names}; {reinstall}")

@@ -51,3 +51,8 @@ def test_a_missing_library_is_named(tmp_path: Path, library: str) -> None:
 def test_the_cpu_build_is_right_for_a_cpu_target(tmp_path: Path) -> None:
     found = onnx_runtime((CPU_PROVIDER,), (CPU_PROVIDER,), {"onnxruntime": "1.31.1"}.get, "x86_64", tmp_path)
     assert found.level is Level.OK
+
+
+def test_a_missing_module_is_a_failed_check_that_names_the_package(tmp_path: Path) -> None:
+    found = onnx_runtime((), (), {}.get, "x86_64", tmp_path)
+    assert found.level is Level.FAIL and found.advice.endswith("pip install --force-reinstall onnxruntime")
