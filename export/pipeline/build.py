@@ -78,8 +78,6 @@ EXPECTED_S = {
     "plan and report": (0.2, 1.0),
 }
 """Expected duration of each kind of stage before the first measurement, s: for a small and for a large model."""
-
-
 COMPUTING = ("vision_encoder", "language_model.prefill")
 """Graphs whose time is limited by computing, not by reading weights."""
 
