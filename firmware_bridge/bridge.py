@@ -28,7 +28,6 @@ from firmware_bridge.core.link import BridgeStatus
 from firmware_bridge.core.robot_state import DdsError
 from firmware_bridge.core.rules import BridgeCore
 from firmware_bridge.core.step_types import Call, Inputs, Move, Outputs
-from firmware_bridge.core.version import version_line
 from firmware_bridge.latch_file import LatchFile, read_latch
 from firmware_bridge.line_log import LineLog
 from firmware_bridge.notify import Notifier
@@ -281,7 +280,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--runner-group", metavar="NAME", help="serve: group that may command (default: none)")
     parser.add_argument("--operator-group", metavar="NAME", help="serve: group that may stop and arm (default: none)")
     parser.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
-    parser.add_argument("--version", action="version", version=version_line("edge-bridge"))
+    parser.add_argument("--version", action="store_true", help="print version, commit and artifact schema")
+    if "--version" in (sys.argv[1:] if argv is None else argv):
+        from firmware_bridge.core.version import version_line  # not part of the process that serves
+
+        sys.stdout.write(f"{version_line('edge-bridge')}\n")
+        return 0
     args = parser.parse_args(argv)
     try:
         if args.json not in (None, "-"):

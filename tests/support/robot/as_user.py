@@ -16,6 +16,7 @@ from firmware_bridge import bridge
 from firmware_bridge.client import BridgeClient, BridgeUnavailable
 from firmware_bridge.client_link import ClientLink
 from firmware_bridge.core.link import BridgeStatus
+from firmware_bridge.unitree import robot_link  # noqa: F401 - what the bridge imports when it serves
 
 
 def main() -> int:
