@@ -75,7 +75,7 @@ def test_changed_thresholds_are_kept_and_printed(tmp_path: Path, capsys: pytest.
     setting = "gates.action_expert.max_abs=0.5"
     assert main(["--out", str(tmp_path / "nano"), "--set", setting]) == 0
     assert main(["verify", str(tmp_path / "nano")]) == 0
-    assert f"note: thresholds were set when it was built: {setting}" in capsys.readouterr().err
+    assert f"note: thresholds were changed with --set for this build: {setting}" in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -86,7 +86,7 @@ def test_a_directory_for_a_users_target_names_the_origin_of_its_thresholds(
     own.write_text((TARGETS_DIR / "cpu.toml").read_text())
     assert main(["--target", str(own), "--out", str(tmp_path / "nano")]) == 0
     assert main(["verify", str(tmp_path / "nano")]) == 0
-    assert "checked against the thresholds that the manifest gives" in capsys.readouterr().err
+    assert "checked against the thresholds in the manifest" in capsys.readouterr().err
 
 
 def test_verify_refuses_artifacts_of_other_weights(artifacts_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -96,7 +96,7 @@ def test_verify_refuses_artifacts_of_other_weights(artifacts_dir: Path, capsys: 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("shipped", "code", "message"), [(False, 2, "give that with"), (True, 1, "other weights than")]
+    ("shipped", "code", "message"), [(False, 2, "pass these weights with"), (True, 1, "other weights than")]
 )
 def test_verify_of_a_checkpoint_takes_the_checkpoint(
     artifacts_dir: Path, tmp_path: Path, capsys: Any, monkeypatch: Any, shipped: bool, code: int, message: str
