@@ -65,8 +65,9 @@ def test_an_image_is_rendered_after_its_request_and_has_a_stamp(studio: Studio) 
     time.sleep(0.05)
     assert studio.made == 0, "nobody looks"
     response = studio.get("/frame.jpg")
-    assert response.status == 200 and response.read() == b"picture 1"
-    assert response.headers["X-Capture-Ns"] == "1001"
+    number = int(response.read().split()[1])  # a second picture may be finished before the first is sent
+    assert response.status == 200 and number >= 1
+    assert response.headers["X-Capture-Ns"] == str(1000 + number)
 
 
 def test_a_stream_is_one_new_picture_after_another(studio: Studio) -> None:
