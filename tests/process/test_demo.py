@@ -224,7 +224,7 @@ def test_a_child_deaf_to_sigint_is_killed_with_all_it_started(tmp_path: Path) ->
     assert not child.running
     end_ns = time.monotonic_ns() + 5_000_000_000
     while psutil.pid_exists(grandchild) and time.monotonic_ns() < end_ns:
-        if psutil.Process(grandchild).status() == psutil.STATUS_ZOMBIE:  # dead; whoever inherited it reaps it
+        if psutil.Process(grandchild).status() == psutil.STATUS_ZOMBIE:  # it has ended; its new parent reaps it
             break
         time.sleep(0.02)
     assert time.monotonic_ns() < end_ns

@@ -176,7 +176,7 @@ def test_a_tenth_of_the_state_messages_lost_is_no_fault(bench: Bench) -> None:
 def test_an_output_that_is_not_finite(bench: Bench) -> None:
     bench.see()
     bench.policy.step = (math.nan, 0.0, 0.0)
-    assert bench.tick() == (0.0, "output-not-finite")  # in the same tick: only the bridge's period comes on top
+    assert bench.tick() == (0.0, "output-not-finite")  # in the same tick
     assert drives_again(bench)
 
 

@@ -24,7 +24,7 @@ BOUND_NS = 300_000_000
 
 
 class Rig:
-    """edge-hil and edge-bridge, running; and the robot's own record of what it was told and what it did."""
+    """Running edge-hil and edge-bridge, with the robot's own record of its commands and motion."""
 
     def __init__(self, trace: Path, socket: Path, folder: Path) -> None:
         self.trace = trace
