@@ -20,25 +20,30 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from firmware_bridge.absent_robot import AbsentRobot
+from firmware_bridge.backends import INSTALL, backend_opener, missing_link, robot_table
 from firmware_bridge.client_link import USER_ONLY, ClientLink, SocketGroups, SocketTakenError
-from firmware_bridge.core.config import OPERATOR_SUFFIX, SERVICE_SOCKET, ConfigError, RobotConfig, load_robot_config
+from firmware_bridge.core.config import (
+    OBSERVER_SUFFIX,
+    OPERATOR_SUFFIX,
+    SERVICE_SOCKET,
+    ConfigError,
+    RobotConfig,
+    load_robot_config,
+)
 from firmware_bridge.core.link import BridgeStatus
-from firmware_bridge.core.robot_state import DdsError
+from firmware_bridge.core.robot_state import LinkOpenError
 from firmware_bridge.core.rules import BridgeCore
-from firmware_bridge.core.step_types import Call, Inputs, Move, Outputs
-from firmware_bridge.latch_file import LatchFile, read_latch
-from firmware_bridge.line_log import LineLog
-from firmware_bridge.notify import Notifier
-from firmware_bridge.output_file import check_output, write_descriptor, write_output
-from firmware_bridge.unitree.late_interface import AbsentRobot, is_interface_up
-from firmware_bridge.unitree.messages import ids
-
-if TYPE_CHECKING:
-    from firmware_bridge.unitree.robot_link import RobotLink
+from firmware_bridge.core.step_types import Backend, Inputs, Move, Outputs, Report, StopMotion
+from firmware_bridge.system.latch_file import LatchFile, read_latch
+from firmware_bridge.system.line_log import LineLog
+from firmware_bridge.system.notify import Notifier
+from firmware_bridge.system.output_file import check_output, write_descriptor, write_output
 
 _OPERATORS: Final = 4  # at a time
+_OBSERVERS: Final = 4
 _LOG_TIMEOUT_S: Final = 0.5
 _LAST_ZEROS: Final = 5  # ticks of zeros between a signal and the exit
 _LATE_NS: Final = 50_000_000  # a step this late is no sign of life for the watchdog
@@ -65,7 +70,7 @@ reach; arm: no runner waits, or more than one bridge)"""
 
 
 class Bridge:
-    """Shell around BridgeCore: joins sockets, robot and clock. Raises DdsError, ConfigError, SocketTakenError."""
+    """Shell around BridgeCore: joins sockets, robot and clock. Raises LinkOpenError, ConfigError, SocketTakenError."""
 
     def __init__(
         self,
@@ -79,15 +84,15 @@ class Bridge:
         self._log = log
         self._notifier = notifier
         self._config = config
-        # Only a process that serves needs the DDS binding; a missing one is found here, before the bridge is ready.
-        from firmware_bridge.unitree.robot_link import RobotLink
-
-        self._open_link = RobotLink
-        self._robot: RobotLink | AbsentRobot = AbsentRobot(config.dds.interface)
+        # Only a process that serves needs the protocol's library; a missing one is found before the bridge is ready.
+        self._open_backend = backend_opener(config)
+        self._robot: Backend = AbsentRobot("")
         self._join_robot()
         self._link = ClientLink(config.bridge.socket, group=groups.runner)
         operators = Path(f"{config.bridge.socket}{OPERATOR_SUFFIX}")
         self._operators = ClientLink(operators, places=_OPERATORS, group=groups.operator)
+        observers = Path(f"{config.bridge.socket}{OBSERVER_SUFFIX}")
+        self._observers = ClientLink(observers, places=_OBSERVERS, group=groups.runner)
         self._estop_file = config.safety.estop_file
         if not latch_path.parent.is_dir():
             raise ConfigError(
@@ -95,7 +100,8 @@ class Bridge:
             )
         latch = read_latch(latch_path)
         self._latch_file = LatchFile(latch_path, log.write)
-        self._core = BridgeCore(config.bridge, config.limits, config.safety, time.monotonic_ns(), latch=latch)
+        table = robot_table(config)
+        self._core = BridgeCore(config.bridge, config.limits, config.safety, table, time.monotonic_ns(), latch=latch)
         self._period_ns = 1_000_000_000 // config.bridge.rate_hz
         self._wake_ns = self._pinged_ns = time.monotonic_ns()
         self._reported, self._ready, self._extended_ns = "", False, -_EXTEND_NS
@@ -103,11 +109,9 @@ class Bridge:
     @property
     def greeting(self) -> str:
         """What this bridge serves, or what it waits for, in one line."""
-        dds, socket_path = self._config.dds, self._config.bridge.socket
         if isinstance(self._robot, AbsentRobot):
-            return f"{self._robot.reason}; plug in the robot's cable, or correct dds.interface in the robot file"
-        where = f"domain {dds.domain} on {dds.interface}, socket {socket_path}"
-        return f"ready, robot {self._config.name}, {where}"
+            return f"{self._robot.reason}; plug in the robot's cable, or correct the robot file"
+        return f"ready, robot {self._config.name}, {self._config.address}, socket {self._config.bridge.socket}"
 
     def run(self, wakeup: socket.socket) -> None:
         """Serve until a byte arrives on `wakeup`; leave with the robot stopped, whatever happens."""
@@ -124,11 +128,13 @@ class Bridge:
         except BaseException:
             if self._core.status(0).commands:
                 self._robot.write(Move(0.0, 0.0, 0.0))
-                self._robot.write(Call(ids.STOP_MOVE))
+                self._robot.write(StopMotion())
             raise
         finally:
             self._link.close()
             self._operators.close()
+            self._observers.close()
+            self._robot.close()
             self._latch_file.close(_LOG_TIMEOUT_S)
 
     def result(self) -> dict[str, object]:
@@ -143,17 +149,21 @@ class Bridge:
         """Wait for input or the deadline; True when it is time to leave."""
         self._wake_ns = wake_ns
         poller = select.poll()
-        for file in (wakeup, *self._link.files(), *self._operators.files()):
+        for file in (wakeup, *self._link.files(), *self._operators.files(), *self._observers.files()):
             poller.register(file, select.POLLIN)
         left_ns = wake_ns - time.monotonic_ns()
         ready = poller.poll(max(-(-left_ns // 1_000_000), 0))
         return any(fd == wakeup.fileno() for fd, _ in ready)
 
     def _join_robot(self) -> bool:
-        """Join the robot's network as soon as its interface is up; whether that has happened in this call."""
-        if not isinstance(self._robot, AbsentRobot) or not is_interface_up(self._robot.interface):
+        """Open the robot's link as soon as it is there; whether that has happened in this call."""
+        if not isinstance(self._robot, AbsentRobot):
             return False
-        self._robot = self._open_link(self._config, self._log.write)
+        missing = missing_link(self._config)
+        if missing is not None:
+            self._robot = AbsentRobot(missing)
+            return False
+        self._robot = self._open_backend(self._config, self._log.write)
         settle_memory()
         return True
 
@@ -174,11 +184,19 @@ class Bridge:
             outputs = replace(outputs, status=replace(outputs.status, reason=reason))
         if isinstance(self._robot, AbsentRobot):
             outputs = replace(outputs, status=replace(outputs.status, reason=self._robot.reason))
+        self._pass_on(robot)
         self._link.send_status(outputs.status)
         if latch_is_kept:  # a stop that an operator has seen confirmed must survive a kill
             self._operators.send_status(outputs.status)
         self._report_progress(outputs.status)
         return outputs
+
+    def _pass_on(self, robot: Report) -> None:
+        """Send the robot's newest report to the observers, whose messages are dropped."""
+        self._observers.malformed += len(self._observers.receive())
+        for message in (robot.state, robot.battery):
+            if message is not None:
+                self._observers.send(message)
 
     def _report_start(self, text: str, now_ns: int) -> None:
         if not isinstance(self._robot, AbsentRobot):
@@ -303,13 +321,11 @@ def main(argv: list[str] | None = None) -> int:
 
             sockets = (config.bridge.socket,) if args.socket else (SERVICE_SOCKET, config.bridge.socket)
             code, result = operate(args.command, *sockets)
-    except (SocketTakenError, ConfigError, DdsError) as error:
+    except (SocketTakenError, ConfigError, LinkOpenError) as error:
         sys.stderr.write(f"edge-bridge: {error}\n")
         return 3 if isinstance(error, SocketTakenError) else 2
     except ModuleNotFoundError as error:
-        sys.stderr.write(
-            f"edge-bridge: {error.name} is missing: pip install 'tic-vla-edge[unitree]' (arm64: edge-install dds)\n"
-        )
+        sys.stderr.write(f"edge-bridge: {error.name} is missing: {INSTALL[config.protocol]}\n")
         return 2
     text = json.dumps(result, indent=2) + "\n"
     try:

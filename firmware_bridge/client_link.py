@@ -175,6 +175,14 @@ class ClientLink:
                 with contextlib.suppress(OSError):  # a closed connection is noticed by receive()
                     client.send(encode(status))
 
+    def send(self, message: Message) -> None:
+        """Send a message to every client; drop it for one that does not read."""
+        if self._clients:
+            data = encode(message)
+            for client in self._clients:
+                with contextlib.suppress(OSError):
+                    client.send(data)
+
     def close(self) -> None:
         """Disconnect the clients and remove the socket file."""
         for file in (self._listener, *self._clients):

@@ -17,7 +17,7 @@ from types import FrameType
 from typing import Any, Final, ParamSpec, TextIO
 
 from firmware_bridge.core.version import version_line
-from firmware_bridge.output_file import (
+from firmware_bridge.system.output_file import (
     check_output,
     open_through,
     partial_of,

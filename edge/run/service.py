@@ -11,8 +11,8 @@ from collections.abc import Callable
 from typing import Final, TextIO, cast
 
 from edge.safety.watchdog import WatchdogFeeder
-from firmware_bridge.line_log import LineLog
-from firmware_bridge.notify import Notifier
+from firmware_bridge.system.line_log import LineLog
+from firmware_bridge.system.notify import Notifier
 
 STATUS_PERIOD_NS: Final = 5_000_000_000
 CAPACITY: Final = 512

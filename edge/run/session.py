@@ -33,7 +33,7 @@ from edge.safety.faults.table import FAULTS
 from edge.safety.watchdog import Hang, ReasoningWatch
 from firmware_bridge.client import BridgeClient, BridgeStatus, BridgeUnavailable
 from firmware_bridge.core.config import RobotConfig
-from firmware_bridge.notify import Notifier
+from firmware_bridge.system.notify import Notifier
 
 CAMERA_LEAD = 0.5
 """Share of a tick period by which a frame is requested before the tick that uses it."""
@@ -245,7 +245,7 @@ class RunSession:
             missing = "state" if inputs.history.newest() is None else "camera frame"
             if deadline.left_s() <= 0 and not waits:
                 why = f" ({inputs.camera.last_error})" if inputs.camera.last_error else ""
-                where = f"DDS domain {self._robot.dds.domain} on {self._robot.dds.interface}"
+                where = self._robot.address
                 raise RefusedError(f"no {missing} from the robot in {READY_TIMEOUT_S:.0f} s on {where}{why}: is it on?")
             if waits:
                 self._reporter.on_wait(f"waiting for the robot: no {missing} yet")

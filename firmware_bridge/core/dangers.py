@@ -6,9 +6,9 @@ import math
 from typing import Final
 
 from firmware_bridge.core.config import SafetyConfig
-from firmware_bridge.core.robot_state import RobotState
+from firmware_bridge.core.robot_state import BatteryState, RobotState
+from firmware_bridge.core.robot_table import RobotTable
 from firmware_bridge.core.step_types import Inputs
-from firmware_bridge.unitree.messages import ids
 
 _NS_PER_S: Final = 1_000_000_000
 _NEVER_NS: Final = -(2**62)
@@ -32,13 +32,15 @@ NO_BATTERY: Final = ("battery_low", "no battery report")
 class DangerWatch:
     """The robot's newest reports and the dangers in them that forbid motion now."""
 
-    def __init__(self, safety: SafetyConfig, state_timeout_ns: int) -> None:
+    def __init__(self, safety: SafetyConfig, table: RobotTable, state_timeout_ns: int) -> None:
         self.robot: RobotState | None = None
         self.version: str | None = None
         self.first_report_ns: int | None = None
         self._safety = safety
+        self._table = table
         self._state_timeout_ns = state_timeout_ns
-        self._battery_percent, self._battery_ns = 0, _NEVER_NS
+        self._battery: BatteryState | None = None
+        self._unsafe: str | None = None
         self._estop = self._writes_fail = False
         self._foreign, self._foreign_ns = "", _NEVER_NS
         self._publishers: str | None = None
@@ -56,8 +58,8 @@ class DangerWatch:
             self._foreign, self._foreign_ns = f"the robot denies {report.denied}: its lease is held", now_ns
         elif report.foreign is not None:
             self._foreign, self._foreign_ns = report.foreign, now_ns
-        if report.battery_percent is not None:
-            self._battery_percent, self._battery_ns = report.battery_percent, now_ns
+        self._battery = report.battery or self._battery
+        self._unsafe = report.unsafe
         self.version = report.version or self.version
         self._publishers, self._writes_fail, self._estop = report.publishers, report.writes_fail, inputs.estop
 
@@ -81,19 +83,21 @@ class DangerWatch:
             return "tipped", f"the robot is tipped over or carried (roll {roll:.0f}, pitch {pitch:.0f} degrees)"
         if robot is not None and robot.error_code not in self._safety.accepted_error_codes:
             return "robot_error", f"the robot reports error {robot.error_code}"
+        if self._unsafe is not None:
+            return "unsafe_robot", self._unsafe
         return None
 
     def obstacle(self, now_ns: int) -> Reason | None:
         """Return what else forbids arming once nothing forbids motion."""
-        percent, least, wanted = self._battery_percent, self._safety.battery_min_percent, self._safety.sport_version
+        battery, least, table = self._battery, self._safety.battery_min_percent, self._table
         if self.fresh(now_ns, self._state_timeout_ns) is None:
             return NO_STATE
-        if least > 0 and now_ns - self._battery_ns > _BATTERY_NS:
+        if least > 0 and (battery is None or now_ns - battery.received_ns > _BATTERY_NS):
             return NO_BATTERY
-        if percent < least:
-            return "battery_low", f"the battery has {percent} %, at least {least} % are needed"
-        if self.version not in (None, wanted):
-            return "wrong_robot", f"the robot's sport service is {self.version}, the robot file expects {wanted}"
+        if battery is not None and battery.soc_percent < least:
+            return "battery_low", f"the battery has {battery.soc_percent} %, at least {least} % are needed"
+        if self.version not in (None, table.version):
+            return "wrong_robot", f"{table.identity} is {self.version}, the robot file expects {table.version}"
         return None
 
     def fresh(self, now_ns: int, timeout_ns: int) -> RobotState | None:
@@ -123,6 +127,6 @@ def is_moving(robot: RobotState) -> bool:
     return math.hypot(robot.vx_mps, robot.vy_mps) >= _STILL_MPS or abs(robot.wz_radps) >= _STILL_RADPS
 
 
-def is_walking(robot: RobotState) -> bool:
-    """Return whether a report shows motion or the locomotion mode."""
-    return is_moving(robot) or robot.mode == ids.MODE_LOCOMOTION
+def is_driven(robot: RobotState, table: RobotTable) -> bool:
+    """Return whether a report shows motion or a mode that implies it."""
+    return is_moving(robot) or robot.mode in table.moving_modes

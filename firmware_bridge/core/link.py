@@ -7,6 +7,8 @@ Little-endian. Header: magic `TVEB`, version u8, kind u8, payload length u16.
   4 status    stamp_ns i64, state u8, zero_after_stop u8, cause u8, blocked_by u8, permit u8, motion u8, last_seq u64,
               commands u64, rejected u64, last command 3 x f64, speed f64, then the reason as UTF-8
   5 release   empty; operator's socket only
+  6 state     the robot's newest report (`RobotState`); observers' socket only
+  7 battery   its battery; observers' socket only
 Version 1 had neither cause nor blocked_by, version 2 had neither permit, motion, speed nor release.
 """
 
@@ -16,6 +18,8 @@ import struct
 from dataclasses import dataclass
 from typing import Final
 
+from firmware_bridge.core.robot_state import BatteryState, RobotState
+
 MAGIC: Final = b"TVEB"
 VERSION: Final = 3
 STATES: Final = ("disarmed", "arming", "armed", "stopped")
@@ -23,7 +27,7 @@ CAUSES: Final = (
     *("none", "client_stop", "client_lost", "deadman", "shutdown", "suspended"),
     *("estop", "remote_takeover", "second_commander", "second_publisher", "link_down"),
     *("state_silent", "wrong_mode", "robot_error", "tipped", "robot_moving"),
-    *("not_standing", "battery_low", "wrong_robot", "operator"),
+    *("not_standing", "battery_low", "wrong_robot", "operator", "unsafe_robot"),
 )
 """Why the bridge has stopped or would refuse to arm.
 
@@ -32,10 +36,11 @@ shutdown: the bridge ends; suspended: the machine slept; estop: an operator, the
 keys; remote_takeover: a stick or key of the robot's remote; second_commander: motion or mode requests of another
 client, or a denied request of ours; second_publisher: an input topic has more than one publisher, or motor commands
 have one; link_down: the network does not take our commands; state_silent: no usable report from the robot;
-wrong_mode: it left its walking modes; robot_error: its error code; tipped: rolled or pitched beyond 30 degrees;
+wrong_mode: it left its driving modes; robot_error: its error code; tipped: rolled or pitched beyond 30 degrees;
 robot_moving: found moving when the bridge started; not_standing: it did not stand up in time; battery_low: less charge
 than the robot file requires; wrong_robot: its sport service has another version than the robot file, or no answer;
-operator: the robot file requires an operator's `edge-bridge arm`, which is still missing.
+operator: the robot file requires an operator's `edge-bridge arm`, which is still missing; unsafe_robot: the robot's
+own protection, such as a failsafe parameter, is weaker than the robot file requires.
 """
 PERMITS: Final = ("not needed", "needed", "given")
 """Whether the next arming needs an operator's `edge-bridge arm`, and whether it was given."""
@@ -44,10 +49,12 @@ MOTIONS: Final = ("unknown", "still", "moving")
 MAX_REASON_BYTES: Final = 400
 MAX_DATAGRAM_BYTES: Final = 512
 
-_ARM, _STOP, _VELOCITY, _STATUS, _RELEASE = 1, 2, 3, 4, 5
+_ARM, _STOP, _VELOCITY, _STATUS, _RELEASE, _STATE, _BATTERY = 1, 2, 3, 4, 5, 6, 7
 _HEADER: Final = struct.Struct("<4sBBH")
 _VELOCITY_BODY: Final = struct.Struct("<Qq3d")
 _STATUS_BODY: Final = struct.Struct("<qBBBBBBQQQ4d")
+_STATE_BODY: Final = struct.Struct("<q6dqqq4d4i")
+_BATTERY_BODY: Final = struct.Struct("<qq2d")
 
 
 class LinkError(ValueError):
@@ -105,7 +112,7 @@ class BridgeStatus:
     speed_mps: float = -1.0
 
 
-Message = Arm | Stop | Release | Velocity | BridgeStatus
+Message = Arm | Stop | Release | Velocity | BridgeStatus | RobotState | BatteryState
 
 
 def encode(message: Message) -> bytes:
@@ -119,6 +126,11 @@ def encode(message: Message) -> bytes:
     if isinstance(message, Velocity):
         velocity = (message.vx_mps, message.vy_mps, message.wz_radps)
         return _frame(_VELOCITY, _VELOCITY_BODY.pack(message.seq, message.stamp_ns, *velocity))
+    if isinstance(message, RobotState):
+        return _frame(_STATE, _pack_state(message))
+    if isinstance(message, BatteryState):
+        battery = (message.received_ns, message.soc_percent, message.voltage_v, message.current_a)
+        return _frame(_BATTERY, _BATTERY_BODY.pack(*battery))
     reason = message.reason.encode("utf-8")[:MAX_REASON_BYTES].decode("utf-8", "ignore").encode("utf-8")
     counters = (message.last_seq, message.commands, message.rejected)
     flags = (STATES.index(message.state), message.zero_after_stop)
@@ -148,7 +160,28 @@ def decode(data: bytes) -> Message:
         return Velocity(*_VELOCITY_BODY.unpack(body))
     if kind == _STATUS and _STATUS_BODY.size <= len(body) <= _STATUS_BODY.size + MAX_REASON_BYTES:
         return _decode_status(body)
+    if kind == _STATE and len(body) == _STATE_BODY.size:
+        return _unpack_state(body)
+    if kind == _BATTERY and len(body) == _BATTERY_BODY.size:
+        return BatteryState(*_BATTERY_BODY.unpack(body))
     raise LinkError(f"kind {kind} with {len(body)} bytes")
+
+
+def _pack_state(state: RobotState) -> bytes:
+    motion = (*state.T_odom_base, state.vx_mps, state.vy_mps, state.wz_radps)
+    attitude = (state.position_z_m, state.roll_rad, state.pitch_rad, state.gyro_wz_radps)
+    codes = (state.mode, state.error_code, state.robot_stamp_ns)
+    return _STATE_BODY.pack(state.received_ns, *motion, *codes, *attitude, *state.foot_forces)
+
+
+def _unpack_state(body: bytes) -> RobotState:
+    received_ns, x, y, theta, vx, vy, wz, *rest = _STATE_BODY.unpack(body)
+    mode, error_code, stamp_ns, z, roll, pitch, gyro_wz, *feet = rest
+    fr, fl, rr, rl = feet
+    pose = (x, y, theta)
+    return RobotState(
+        received_ns, pose, vx, vy, wz, mode, error_code, stamp_ns, z, roll, pitch, gyro_wz, (fr, fl, rr, rl)
+    )
 
 
 def _decode_status(body: bytes) -> BridgeStatus:

@@ -11,7 +11,11 @@ _CLOCK_DRIFT: Final = 1000  # 1 ms a second, ten times what a quartz does
 _MAX_AHEAD_NS: Final = 500_000_000  # our choice: far above the jitter of a loaded robot, too short to hide a report
 
 
-class DdsError(RuntimeError):
+class LinkOpenError(RuntimeError):
+    """The robot's link cannot be opened; one line for the operator."""
+
+
+class DdsError(LinkOpenError):
     """DDS cannot start; one line for the operator."""
 
 

@@ -1,13 +1,13 @@
-"""The bridge's rules, without clock, socket or DDS: `BridgeCore.step(inputs, now_ns) -> Outputs`.
+"""The bridge's rules, without clock, socket or protocol: `BridgeCore.step(inputs, now_ns) -> Outputs`.
 
 States: disarmed -> arming -> armed -> stopped -> (explicit arm) arming ...
 * disarmed: the bridge sends nothing, with two exceptions: a robot found moving when the bridge starts is stopped, and
   so is a robot that moves when an emergency stop is pressed (also after an arming that was broken off).
-* arming: the robot names its version and is stood up call by call, each confirmed by the mode it reports. A danger or
-  a time-out refuses with a reason.
+* arming: the robot names its version and is made ready step by step, each confirmed by the mode it reports. A danger
+  or a time-out refuses with a reason.
 * armed: the newest good command goes out at the bridge's own rate through limits and slew.
-* stopped: latched. A zero Move and a StopMove go out at once, then zero Moves at the same rate without end, so that a
-  late Move never lasts longer than a period. StopMove is repeated while the robot moves. No message of the robot's
+* stopped: latched. A zero Move and a StopMotion go out at once, then zero Moves at the same rate without end, so that a
+  late Move never lasts longer than a period. StopMotion is repeated while the robot moves. No message of the robot's
   network ends the zeros: only an operator's `edge-bridge release` does, so that a person can use the remote.
 An emergency stop (operator, remote keys, local input) latches in every state. Only an operator's arm for a waiting
 runner ends it (`permit.py`).
@@ -21,26 +21,17 @@ import math
 from typing import Final
 
 from firmware_bridge.core.config import BridgeConfig, LimitsConfig, SafetyConfig
-from firmware_bridge.core.dangers import NO_BATTERY, NO_STATE, DangerWatch, Reason, is_moving, is_walking
+from firmware_bridge.core.dangers import NO_BATTERY, NO_STATE, DangerWatch, Reason, is_driven, is_moving
 from firmware_bridge.core.link import Arm, BridgeStatus, Release, Stop, Velocity
 from firmware_bridge.core.permit import OperatorPermit
-from firmware_bridge.core.step_types import Call, Inputs, Move, Outputs
-from firmware_bridge.unitree.messages import ids
+from firmware_bridge.core.robot_state import RobotState
+from firmware_bridge.core.robot_table import RobotTable
+from firmware_bridge.core.step_types import Identify, Inputs, Move, Outputs, Request, Stand, StopMotion
 
 _NS_PER_MS: Final = 1_000_000
 _NS_PER_S: Final = 1_000_000_000
 _NEVER_NS: Final = -(2**62)
 _ZERO: Final = (0.0, 0.0, 0.0)
-# Request that brings a robot in this mode nearer to walking. Other modes get RecoveryStand, which the maker documents
-# as working from any posture.
-_NEXT_CALL: Final = {
-    ids.MODE_IDLE: ids.STAND_UP,
-    ids.MODE_LIE_DOWN: ids.STAND_UP,
-    ids.MODE_JOINT_LOCK: ids.BALANCE_STAND,
-    ids.MODE_LOCOMOTION: ids.STOP_MOVE,  # another client was driving: stop first
-}
-_CALL_AGAIN_NS: Final = 3 * _NS_PER_S  # standing up takes up to 2 s and must not be started over
-_MODES_ARMED: Final = frozenset({ids.MODE_IDLE, ids.MODE_BALANCE_STAND, ids.MODE_LOCOMOTION})
 _STOP_AGAIN_NS: Final = 100 * _NS_PER_MS
 _FOUND_MOVING_NS: Final = _NS_PER_S  # a Go2 holds its last Move for one second after its commander has died
 _STOPPING_NS: Final = 500 * _NS_PER_MS  # our choice: time after a stop from which a moving robot counts as disobeying
@@ -60,11 +51,18 @@ class BridgeCore:
     """State machine and gate of one bridge process; `step` may be called at any rate."""
 
     def __init__(
-        self, bridge: BridgeConfig, limits: LimitsConfig, safety: SafetyConfig, now_ns: int, *, latch: str = ""
+        self,
+        bridge: BridgeConfig,
+        limits: LimitsConfig,
+        safety: SafetyConfig,
+        table: RobotTable,
+        now_ns: int,
+        *,
+        latch: str = "",
     ) -> None:
         """`latch`: reason of an earlier bridge process's emergency stop, or empty."""
         self.clipped = 0
-        self._safety = safety
+        self._table = table
         self._period_ns = _NS_PER_S // bridge.rate_hz
         self._deadman_ns = bridge.deadman_ms * _NS_PER_MS
         self._arm_timeout_ns = int(bridge.arm_timeout_s * _NS_PER_S)
@@ -74,19 +72,19 @@ class BridgeCore:
         # Growth per tick, from the nominal period: a late tick must not allow a larger jump.
         self._growth = tuple(a / bridge.rate_hz for a in (limits.accel_mps2, limits.accel_mps2, limits.alpha_radps2))
         self._state, self._cause, self._reason = "disarmed", "none", "waiting for a client to arm"
-        self._watch = DangerWatch(safety, self._state_timeout_ns)
+        self._watch = DangerWatch(safety, table, self._state_timeout_ns)
         self._permit = OperatorPermit(safety.operator_arm, latch)
         self._had_client = self._ever_armed = self._released = False
         self._pressed = (False, False, False)
         self._pressed_ns = _NEVER_NS
         self._asleep_ns: int | None = None
         self._stop_sent_ns = self._stopped_ns = self._asked_ns = _NEVER_NS
-        self._called: dict[int, int] = {}  # api id -> when, during this arming
+        self._called: dict[int | None, int] = {}  # step -> when, during this arming
         self._arm_until_ns = self._good_until_ns = 0
         self._next_ns = now_ns
         self._target = self._last_command = _ZERO
         self._last_seq, self._commands, self._rejected = -1, 0, 0
-        self._requests: list[Move | Call] = []
+        self._requests: list[Request] = []
 
     def step(self, inputs: Inputs, now_ns: int) -> Outputs:
         """Take one step's inputs and return the requests and velocity for the robot."""
@@ -170,7 +168,7 @@ class BridgeCore:
             self._pressed_ns = now_ns
         robot = self._watch.fresh(now_ns, self._state_timeout_ns)
         idle = self._state in ("disarmed", "stopped") and not self._ever_armed
-        if idle and robot is not None and is_walking(robot):
+        if idle and robot is not None and is_driven(robot, self._table):
             self._state, self._ever_armed = "armed", True
             self._stop("estop", self._permit.latch, now_ns)
 
@@ -242,38 +240,44 @@ class BridgeCore:
         elif blocked is not None:
             self._stop(*blocked, now_ns)
         elif late:
-            if self._watch.version is None:
-                self._stop("wrong_robot", f"the robot's sport service does not answer {waited}", now_ns)
+            if self._is_unknown():
+                self._stop("wrong_robot", f"{self._table.identity} does not answer {waited}", now_ns)
             else:
-                self._stop("not_standing", f"the robot is in mode {robot.mode}, not standing {waited}", now_ns)
-        elif self._watch.version is None:
+                mode = self._table.name_of(robot.mode)
+                self._stop("not_standing", f"the robot is in {mode}, not ready {waited}", now_ns)
+        elif self._is_unknown():
             if now_ns - self._asked_ns >= _NS_PER_S:
                 self._asked_ns, self._reason = now_ns, "requesting the robot's version"
-                self._requests.append(Call(ids.API_VERSION))
+                self._requests.append(Identify())
         else:
-            walks = robot.mode == ids.MODE_BALANCE_STAND and is_moving(robot)
-            self._stand_up_from(ids.MODE_LOCOMOTION if walks else robot.mode, now_ns)
+            self._stand_up_from(robot, now_ns)
 
-    def _stand_up_from(self, mode: int, now_ns: int) -> None:
-        call = _NEXT_CALL.get(mode, ids.RECOVERY_STAND)
-        if mode == ids.MODE_BALANCE_STAND:
+    def _is_unknown(self) -> bool:
+        return self._table.version is not None and self._watch.version is None
+
+    def _stand_up_from(self, robot: RobotState, now_ns: int) -> None:
+        table, ready = self._table, robot.mode in self._table.ready_modes
+        if ready and not is_moving(robot):
             self._state, self._reason, self._ever_armed = "armed", "driving", True
             self._permit.finish()
             # The runner streams commands while arming; one that starts only now has a deadman time to do so.
             self._good_until_ns = max(self._good_until_ns, now_ns + self._deadman_ns)
             self._next_ns = now_ns
-        elif now_ns - self._called.get(call, _NEVER_NS) >= _CALL_AGAIN_NS:
-            self._called[call] = now_ns
+            return
+        step = None if ready else table.next_step.get(robot.mode, table.recovery_step)
+        if now_ns - self._called.get(step, _NEVER_NS) >= table.repeat_ns:
+            self._called[step] = now_ns
             self._permit.begin()
-            self._reason = f"{ids.SPORT_API_NAMES[call]} sent, robot in mode {mode}"
-            self._requests.append(Call(call))
+            name = "stop" if step is None else table.step_names[step]
+            self._reason = f"{name} sent, robot in {table.name_of(robot.mode)}"
+            self._requests.append(StopMotion() if step is None else Stand(step))
 
     def _check_armed(self, now_ns: int) -> None:
         robot = self._watch.fresh(now_ns, self._state_timeout_ns)
         if robot is None:
             self._stop("state_silent", "no state from the robot any more", now_ns)
-        elif robot.mode not in _MODES_ARMED:
-            self._stop("wrong_mode", f"the robot left its walking modes (mode {robot.mode})", now_ns)
+        elif robot.mode not in self._table.armed_modes:
+            self._stop("wrong_mode", f"the robot left its driving modes ({self._table.name_of(robot.mode)})", now_ns)
 
     def _stop(self, cause: str, reason: str, now_ns: int) -> None:
         self._permit.void()
@@ -294,7 +298,7 @@ class BridgeCore:
         robot, first_ns = self._watch.robot, self._watch.first_report_ns
         if self._state != "disarmed" or self._ever_armed or first_ns is None or robot is None:
             return
-        if is_walking(robot) and now_ns - first_ns <= _FOUND_MOVING_NS:
+        if is_driven(robot, self._table) and now_ns - first_ns <= _FOUND_MOVING_NS:
             self._state, self._ever_armed = "armed", True  # the previous bridge's state
             self._stop("robot_moving", "the robot was moving when the bridge started; stopped it", now_ns)
 
@@ -326,4 +330,4 @@ class BridgeCore:
 
     def _send_stop(self, now_ns: int) -> None:
         self._stop_sent_ns = now_ns
-        self._requests.append(Call(ids.STOP_MOVE))
+        self._requests.append(StopMotion())

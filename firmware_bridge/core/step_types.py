@@ -4,20 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 from firmware_bridge.core.link import BridgeStatus, Message
-from firmware_bridge.core.robot_state import RobotState
+from firmware_bridge.core.robot_state import BatteryState, RobotState
 
 
 @dataclass(frozen=True)
 class Report:
     """Messages from the robot's network since the last step.
 
-    `remote_in_use`: a stick or key of the robot's remote is in use. `remote_estop`: its emergency-stop keys were
-    pressed. `foreign` names a motion or mode request of another client. `denied` names a request of ours that the
-    robot denied because another client holds its lease. `publishers` names the input topic that has more than one
-    publisher, or reports a foreign publisher of motor commands. `version` is the sport service's version from its
-    answer. `writes_fail`: the network has refused our last commands.
+    `remote_in_use`: a person drives the robot by its remote, or has switched it to a mode of the remote.
+    `remote_estop`: the robot's own emergency stop was pressed. `foreign` names a motion or mode request of another
+    client. `denied` names a request of ours that the robot denied because another client holds its lease. `publishers`
+    names the input that has more than one publisher. `version` is the robot's answer to `Identify`. `writes_fail`: the
+    network has refused our last commands. `unsafe` names a property of the robot that forbids motion, such as a
+    failsafe of its own that is weaker than the bridge's.
     """
 
     state: RobotState | None = None
@@ -26,9 +28,10 @@ class Report:
     foreign: str | None = None
     denied: str | None = None
     publishers: str | None = None
-    battery_percent: int | None = None
+    battery: BatteryState | None = None
     version: str | None = None
     writes_fail: bool = False
+    unsafe: str | None = None
 
 
 @dataclass(frozen=True)
@@ -58,10 +61,39 @@ class Move:
 
 
 @dataclass(frozen=True)
-class Call:
-    """Write this request of the sport service to the robot, without waiting for its answer."""
+class StopMotion:
+    """Request that the robot stops by its own means, without waiting for its answer."""
 
-    api_id: int
+
+@dataclass(frozen=True)
+class Identify:
+    """Request the robot's version; a later report contains the answer."""
+
+
+@dataclass(frozen=True)
+class Stand:
+    """Request one step of `RobotTable.next_step`, without waiting for its answer."""
+
+    step: int
+
+
+Request = Move | StopMotion | Identify | Stand
+
+
+class Backend(Protocol):
+    """One protocol's robot as the bridge sees it; no method waits and none raises."""
+
+    def read(self, now_ns: int) -> Report:
+        """Return the report of all messages since the last call; send what the protocol needs periodically."""
+
+    def write(self, request: Request) -> None:
+        """Send one request; one that the network does not accept is counted."""
+
+    def dropped(self) -> tuple[int, int, int]:
+        """Return counts so far: impossible messages, reports out of order, requests that the network refused."""
+
+    def close(self) -> None:
+        """Leave the robot's network."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +103,7 @@ class Outputs:
     `latch`: reason of a latched emergency stop, empty without one; it must survive a restart of the bridge.
     """
 
-    requests: tuple[Move | Call, ...]
+    requests: tuple[Request, ...]
     status: BridgeStatus
     wake_ns: int
     latch: str = ""

@@ -9,7 +9,7 @@ from typing import Final
 
 from firmware_bridge.core.config import RobotConfig
 from firmware_bridge.core.robot_state import BatteryState, CameraError, RobotState, StampOrder
-from firmware_bridge.unitree.dds import Bus, take_each
+from firmware_bridge.dds.bus import Bus, take_each
 from firmware_bridge.unitree.messages.idl import SportModeState_
 from firmware_bridge.unitree.messages.idl_low import LowState_
 from firmware_bridge.unitree.messages.ids import GET_IMAGE_SAMPLE, LF_LOW_STATE_TOPIC, SPORT_STATE_TOPIC, VIDEO_SERVICE
@@ -46,7 +46,7 @@ class Go2Reader:
         self._publishers: PublisherWatch | None = None
         self._motor_publishers = config.safety.robot_lowcmd_publishers
         self._closing = threading.Event()
-        self._bus = bus or Bus(config.dds)
+        self._bus = bus or Bus(config.network)
         self._owns_bus = bus is None
         self._reader = self._bus.reader(SPORT_STATE_TOPIC, SportModeState_)
         self._low_reader = self._bus.reader(LF_LOW_STATE_TOPIC, LowState_)

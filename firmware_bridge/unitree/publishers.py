@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 
-from firmware_bridge.unitree.dds import DDS_ERRORS, DECODE_ERRORS, Bus
+from firmware_bridge.dds.bus import DDS_ERRORS, DECODE_ERRORS, Bus
 from firmware_bridge.unitree.messages import ids
 
 _FEW: Final = 16  # announcements a step

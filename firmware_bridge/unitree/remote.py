@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from firmware_bridge.unitree.messages.ids import REMOTE_KEYS
+from firmware_bridge.core.sections import REMOTE_KEYS
 
 TOGETHER_NS: Final = 500_000_000
 """Time within which key presses count as one combination: a person rarely presses two keys within one 20 ms sample,

@@ -11,7 +11,7 @@ import time
 from dataclasses import dataclass
 from typing import Final
 
-from firmware_bridge.unitree.dds import DDS_ERRORS, MAX_SAMPLE_BYTES, Bus, take_each
+from firmware_bridge.dds.bus import DDS_ERRORS, MAX_SAMPLE_BYTES, Bus, take_each
 from firmware_bridge.unitree.messages import idl
 from firmware_bridge.unitree.messages.ids import request_topic, response_topic
 

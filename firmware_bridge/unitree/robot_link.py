@@ -9,9 +9,9 @@ from typing import Any, Final
 from cyclonedds.sub import DataReader
 
 from firmware_bridge.core.config import RobotConfig
-from firmware_bridge.core.robot_state import RobotState, StampOrder, within
-from firmware_bridge.core.step_types import Call, Move, Report
-from firmware_bridge.unitree.dds import Bus, take_each
+from firmware_bridge.core.robot_state import BatteryState, RobotState, StampOrder, within
+from firmware_bridge.core.step_types import Identify, Move, Report, Request, Stand
+from firmware_bridge.dds.bus import Bus, take_each
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.messages.idl import Request_, SportModeState_, WirelessController_
 from firmware_bridge.unitree.messages.idl_low import LowState_
@@ -39,7 +39,7 @@ class RobotLink:
         self._velocity_frame = config.odometry.velocity_frame
         self._deadband = config.safety.remote_deadband
         self._stop_keys = StopKeys(config.safety.remote_estop_keys)
-        self._bus = bus = Bus(config.dds, max_sample_bytes=_MAX_KEPT_BYTES)
+        self._bus = bus = Bus(config.network, max_sample_bytes=_MAX_KEPT_BYTES)
         self._sport = Requester(bus, ids.SPORT_SERVICE, allowed=ids.BRIDGE_ALLOWED)
         self._states = bus.reader(ids.SPORT_STATE_TOPIC, SportModeState_)
         self._low_states = bus.reader(ids.LF_LOW_STATE_TOPIC, LowState_)
@@ -61,21 +61,29 @@ class RobotLink:
     def read(self, now_ns: int) -> Report:
         """Return the report of all messages since the last call."""
         in_use, estop = self._remote(now_ns)
-        state, foreign, battery_percent = self._newest_state(), self._foreign(), self._battery_percent(now_ns)
+        state, foreign, battery = self._newest_state(), self._foreign(), self._newest_battery(now_ns)
         version, denied = self._answers()
         failing = self._sport.failing >= _FAILING_WRITES
         publishers = self._publishers.surplus()
-        return Report(state, in_use, estop, foreign, denied, publishers, battery_percent, version, failing)
+        return Report(state, in_use, estop, foreign, denied, publishers, battery, version, failing)
 
-    def write(self, request: Move | Call) -> None:
+    def close(self) -> None:
+        """Leave the bus."""
+        self._bus.close()
+
+    def write(self, request: Request) -> None:
         """Send one request without waiting. A request that the network does not accept is counted."""
         if isinstance(request, Move):
             parameter = move_parameter(request.vx_mps, request.vy_mps, request.wz_radps)
             self._sport.send(ids.MOVE, parameter, noreply=True)
-        elif (request_id := self._sport.send(request.api_id)) is not None:
+            return
+        api_id = ids.STOP_MOVE
+        if isinstance(request, (Identify, Stand)):
+            api_id = ids.API_VERSION if isinstance(request, Identify) else request.step
+        if (request_id := self._sport.send(api_id)) is not None:
             if len(self._sent) >= _MAX_UNANSWERED:
                 self._sent.clear()
-            self._sent[request_id] = request.api_id
+            self._sent[request_id] = api_id
 
     def _newest_state(self) -> RobotState | None:
         newest = None
@@ -110,16 +118,15 @@ class RobotLink:
                     foreign = f"{service} {api_id}"
         return foreign
 
-    def _battery_percent(self, now_ns: int) -> int | None:
+    def _newest_battery(self, now_ns: int) -> BatteryState | None:
         if now_ns < self._battery_due_ns:
             return None
-        percent = None
+        battery = None
         for sample in _few(self._low_states):
             battery = None if sample is None else battery_state(sample, now_ns)
             self._malformed += battery is None
-            percent = None if battery is None else battery.soc_percent
             self._battery_due_ns = now_ns + _BATTERY_PERIOD_NS
-        return percent
+        return battery
 
     def _answers(self) -> tuple[str | None, str | None]:
         """Return the sport service's version and the request that it has denied; report errors to the operator."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 from typing import Final
 
-from firmware_bridge.unitree.dds import Bus
-from firmware_bridge.unitree.messages.binding import has_reader, has_writer
+from firmware_bridge.dds.binding import has_reader, has_writer
+from firmware_bridge.dds.bus import Bus
 from firmware_bridge.unitree.requests import MAX_BINARY_BYTES, Requester, Response, make_request, move_parameter
 
 __all__ = ["MAX_BINARY_BYTES", "Response", "RpcClient", "RpcError", "make_request", "move_parameter"]

@@ -25,7 +25,7 @@ from edge.core.cli import (
 )
 from firmware_bridge.core.config import ConfigError
 from firmware_bridge.core.robot_state import DdsError
-from firmware_bridge.unitree.dds import DDS_ERRORS
+from firmware_bridge.dds.bus import DDS_ERRORS
 from sim_hil.hil.display import check_display
 from sim_hil.hil.loop import POSE_HZ, STEPS_PER_S, HilLoop
 from sim_hil.hil.trace import TraceWriter

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_bridge.core.link import Arm, Stop, Velocity
-from firmware_bridge.core.step_types import Call, Move
+from firmware_bridge.core.step_types import Move, Stand, StopMotion
 from firmware_bridge.unitree.messages import ids
 from tests.support.robot.bridge_bench import BRIDGE, LIMITS, MS, ZERO, Bench
 
@@ -67,7 +67,7 @@ class TestArming:
         bench.ask_to_arm()
         bench.wait(10_100)
         assert bench.status.state == "disarmed"
-        assert bench.status.reason == "arm refused: the robot is in mode 5, not standing after 10 s"
+        assert bench.status.reason == "arm refused: the robot is in mode 5, not ready after 10 s"
 
     def test_a_new_attempt_starts_from_the_beginning(self) -> None:
         bench = Bench(mode=ids.MODE_LIE_DOWN)
@@ -272,7 +272,7 @@ class TestEveryStop:
         bench = Bench().arm()
         bench.drive(500)
         cause(bench)
-        where = [request for _, request in bench.written].index(Call(ids.STOP_MOVE))
+        where = [request for _, request in bench.written].index(StopMotion())
         assert bench.written[where - 1][1] == ZERO
         assert bench.status.zero_after_stop
 
@@ -389,5 +389,5 @@ def test_no_order_of_events_moves_the_robot_300_ms_after_the_last_good_command(e
             bench.wait(event[1])
         for t, request in bench.written:
             assert request == ZERO or not isinstance(request, Move) or t - good_ns <= 300 * MS
-            assert not isinstance(request, Call) or request.api_id in ids.BRIDGE_ALLOWED
+            assert not isinstance(request, Stand) or request.step in ids.BRIDGE_ALLOWED
         bench.written.clear()

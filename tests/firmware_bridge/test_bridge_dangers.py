@@ -10,11 +10,11 @@ from itertools import pairwise
 import pytest
 
 from firmware_bridge.core.link import Arm, Stop, Velocity
-from firmware_bridge.core.step_types import Call, Move
+from firmware_bridge.core.step_types import Move, StopMotion
 from firmware_bridge.unitree.messages import ids
 from tests.support.robot.bridge_bench import MS, SAFETY, ZERO, Bench
 
-STOP_MOVE = Call(ids.STOP_MOVE)
+STOP_MOVE = StopMotion()
 
 
 def _foreign(bench: Bench) -> None:
@@ -111,7 +111,8 @@ def test_a_silent_robot_blocks_arming() -> None:
 class TestBattery:
     def test_below_the_minimum_arming_is_refused(self) -> None:
         bench = Bench()
-        bench.step(battery_percent=9)
+        bench.battery = 9
+        bench.step()
         bench.ask_to_arm()
         assert (bench.status.state, bench.status.cause) == ("disarmed", "battery_low")
         assert bench.status.reason == "arm refused: the battery has 9 %, at least 10 % are needed"
@@ -131,7 +132,8 @@ class TestBattery:
         bench = Bench(battery=None)
         bench.ask_to_arm()
         bench.wait(900)
-        bench.step(battery_percent=80)
+        bench.battery = 80
+        bench.step()
         bench.wait(100)
         assert bench.status.state == "armed"
 
@@ -150,7 +152,8 @@ class TestBattery:
     def test_it_does_not_end_a_drive(self) -> None:
         bench = Bench().arm()
         bench.command()
-        bench.step(battery_percent=3)
+        bench.battery = 3
+        bench.step()
         assert bench.status.state == "armed"
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from firmware_bridge.core.link import Arm, Release, Stop, Velocity
-from firmware_bridge.core.step_types import Call
+from firmware_bridge.core.step_types import StopMotion
 from firmware_bridge.unitree.messages import ids
 from tests.support.robot.bridge_bench import SAFETY, ZERO, Bench
 
@@ -265,7 +265,7 @@ class TestConfirmation:
         bench.wait(2000)
         bench.robot = {"vx_mps": 0.5}
         _operator(bench)
-        assert [request for _, request in bench.written] == [ZERO, Call(ids.STOP_MOVE)]
+        assert [request for _, request in bench.written] == [ZERO, StopMotion()]
 
 
 class TestRelease:
@@ -314,7 +314,7 @@ class TestPressOutsideADrive:
         bench.step()
         bench.written.clear()
         press(bench)
-        assert [request for _, request in bench.written] == [ZERO, Call(ids.STOP_MOVE)]
+        assert [request for _, request in bench.written] == [ZERO, StopMotion()]
 
     @pytest.mark.parametrize("press", [_operator, _remote_estop, _local_estop])
     @pytest.mark.parametrize("state", [_disarmed, _released])

@@ -14,13 +14,15 @@ from pathlib import Path
 
 import pytest
 
+from firmware_bridge.absent_robot import AbsentRobot
 from firmware_bridge.client import BridgeClient
 from firmware_bridge.core.config import OPERATOR_SUFFIX, load_robot_config
 from firmware_bridge.core.link import Arm, BridgeStatus, Stop
 from firmware_bridge.core.rules import BridgeCore
 from firmware_bridge.core.step_types import Inputs
+from firmware_bridge.dds.interface import is_interface_up
 from firmware_bridge.operate import operate
-from firmware_bridge.unitree.late_interface import AbsentRobot, is_interface_up
+from firmware_bridge.unitree.table import robot_table
 from tests.support.notify_socket import NotifySocket, notify_socket
 from tests.support.processes import GO2_SIM, REPOSITORY, wait_for
 
@@ -51,7 +53,7 @@ def test_an_interface_is_up_once_it_has_an_address(interface: str, up: bool) -> 
 
 def waiting_core() -> BridgeCore:
     config = load_robot_config(GO2_SIM)
-    return BridgeCore(config.bridge, config.limits, config.safety, 0)
+    return BridgeCore(config.bridge, config.limits, config.safety, robot_table(config), 0)
 
 
 def test_without_the_interface_no_runner_is_armed() -> None:

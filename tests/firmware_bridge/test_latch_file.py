@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from firmware_bridge.latch_file import LatchFile, read_latch
+from firmware_bridge.system.latch_file import LatchFile, read_latch
 from tests.support.processes import wait_for
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import threading
 
-from firmware_bridge.line_log import LineLog
+from firmware_bridge.system.line_log import LineLog
 
 
 class StalledStream(io.StringIO):

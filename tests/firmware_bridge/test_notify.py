@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from firmware_bridge.notify import MAX_STATUS_CHARS, Notifier
+from firmware_bridge.system.notify import MAX_STATUS_CHARS, Notifier
 from tests.support.notify_socket import NotifySocket, notify_socket
 
 

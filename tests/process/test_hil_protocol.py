@@ -18,8 +18,8 @@ import psutil
 import pytest
 
 from firmware_bridge.core.config import DdsConfig, load_robot_config
+from firmware_bridge.dds.bus import Bus
 from firmware_bridge.unitree.client import Go2Reader
-from firmware_bridge.unitree.dds import Bus
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.rpc import RpcClient, RpcError, move_parameter
 from sim_hil.hil.command import main

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.flightlog.recorder import Recorder
-from firmware_bridge.output_file import partial_of
+from firmware_bridge.system.output_file import partial_of
 from reporting import page
 from tests.support.html_page import HtmlPage, assert_loads_nothing
 from tests.support.runner import synthetic_run

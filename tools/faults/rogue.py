@@ -13,7 +13,7 @@ import sys
 import time
 
 from firmware_bridge.core.config import DdsConfig
-from firmware_bridge.unitree.dds import Bus
+from firmware_bridge.dds.bus import Bus
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.rpc import RpcClient, move_parameter
 

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from edge.core.cli import command_line, open_stream
 from firmware_bridge.core.config import DdsConfig
-from firmware_bridge.unitree.dds import Bus, take_each
+from firmware_bridge.dds.bus import Bus, take_each
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.messages.idl import Request_
 from sim_hil.protocols.unitree.services.sport import parse_move

@@ -126,7 +126,7 @@ def examine(args: argparse.Namespace, root: Path = ROOT) -> Iterator[Check]:
     yield from _graphs(args, loaded, plan)
     yield robot_check
     if robot is not None:
-        yield doctor_robot.cable(robot.dds.interface, root)
+        yield doctor_robot.cable(robot.network.interface, root)
         yield doctor_robot.bridge(robot)
         yield from doctor_robot.robot_link(robot, 448 if loaded is None else loaded.runtime.image_px)
 

@@ -129,7 +129,7 @@ def robot_link(
     timeout_s: float = STATE_TIMEOUT_S,
 ) -> list[Check]:
     """Whether the robot reports its state, and one picture of its camera."""
-    where = f"DDS domain {robot.dds.domain} on {robot.dds.interface}"
+    where = robot.address
     try:
         reader = open_reader(robot)
     except DdsError as error:

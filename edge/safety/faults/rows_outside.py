@@ -136,7 +136,7 @@ BRIDGE: tuple[Fault, ...] = (
     ),
     Fault(
         "robot-mode-left", 42, Action.STOP, 1000, "bridge",
-        "The robot left its walking modes by itself.",
+        "The robot left its driving modes by itself.",
         "Check the robot: it may have fallen or been taken over; then arm again.",
         "tests/firmware_bridge/test_bridge_core.py::TestEveryStop::test_a_zero_move_and_then_a_stop_move_go_out_first",
     ),

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import cyclonedds.idl.types as t
 from cyclonedds.idl import IdlStruct
 
-from firmware_bridge.unitree.messages.binding import Octet
+from firmware_bridge.dds.binding import Octet
 
 # mypy cannot read `t.array[...]`: it sees plain sequences, the CDR code sees the lengths.
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import cyclonedds.idl.types as t
 from cyclonedds.idl import IdlStruct
 
-from firmware_bridge.unitree.messages.binding import Octet
+from firmware_bridge.dds.binding import Octet
 from firmware_bridge.unitree.messages.idl import I16x4, IMUState_
 
 if TYPE_CHECKING:

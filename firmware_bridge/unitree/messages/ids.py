@@ -52,11 +52,6 @@ COMMANDING_SERVICES: Final = {
     ROBOT_STATE_SERVICE: frozenset({API_VERSION, 1002, 1003}),  # SetReportFreq, ServiceList
     OBSTACLES_AVOID_SERVICE: frozenset({API_VERSION, 1002}),  # SwitchGet
 }
-# Bits of WirelessController_.keys, lowest first.
-REMOTE_KEYS: Final = (
-    *("R1", "L1", "start", "select", "R2", "L2", "F1", "F2"),
-    *("A", "B", "X", "Y", "up", "right", "down", "left"),
-)
 
 OK: Final = 0
 ERROR_NOT_IMPLEMENTED: Final = 3203

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from edge.core.geometry import SE2
 from firmware_bridge.core.config import DdsConfig
-from firmware_bridge.unitree.dds import Bus, take_each
+from firmware_bridge.dds.bus import Bus, take_each
 from firmware_bridge.unitree.messages import ids
 from sim_hil.protocols.base import CameraFrontEnd
 from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, ReceivedCommand

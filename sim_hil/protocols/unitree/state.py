@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any, Final
 from cyclonedds._clayer import ddspy_write
 from cyclonedds.pub import DataWriter
 
-from firmware_bridge.unitree.dds import DDS_ERRORS, Bus
+from firmware_bridge.dds.binding import has_reader
+from firmware_bridge.dds.bus import DDS_ERRORS, Bus
 from firmware_bridge.unitree.messages import ids
-from firmware_bridge.unitree.messages.binding import has_reader
 from firmware_bridge.unitree.messages.crc import LOW_STATE_LAYOUT, crc_of_words, low_state_values
 from firmware_bridge.unitree.messages.idl import IMUState_, PathPoint_, SportModeState_, TimeSpec_, WirelessController_
 from firmware_bridge.unitree.messages.idl_low import BmsState_, LowState_, MotorState_

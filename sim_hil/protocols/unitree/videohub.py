@@ -15,7 +15,7 @@ import sys
 from typing import Final
 
 from firmware_bridge.core.config import DdsConfig
-from firmware_bridge.unitree.dds import Bus
+from firmware_bridge.dds.bus import Bus
 from firmware_bridge.unitree.messages import ids
 from sim_hil.processes.child_process import input_is_open, take_standard_output, write_message
 from sim_hil.protocols.render_process import encode_jpeg

@@ -222,7 +222,7 @@ class TestRunner:
     def test_a_robot_that_does_not_stand_up_in_time_is_a_refusal_after_any_wait(self) -> None:
         runner = Runner(bench_of(mode=ids.MODE_LIE_DOWN))
         runner.at_ms[60_000] = runner.permit
-        with pytest.raises(RefusedError, match="not standing after 10 s"):
+        with pytest.raises(RefusedError, match="not ready after 10 s"):
             runner.run()
 
     @pytest.mark.parametrize(

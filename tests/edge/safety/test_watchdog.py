@@ -10,7 +10,7 @@ import pytest
 
 from edge.run.service import STATUS_PERIOD_NS, ServiceReporter
 from edge.safety.watchdog import NEEDED_ON_TIME, WINDOW_TICKS, Hang, ReasoningWatch, WatchdogFeeder
-from firmware_bridge.notify import Notifier
+from firmware_bridge.system.notify import Notifier
 from tests.support.notify_socket import NotifySocket, notify_socket
 
 TICK_NS = 100_000_000

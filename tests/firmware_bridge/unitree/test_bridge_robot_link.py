@@ -10,8 +10,8 @@ import pytest
 
 from firmware_bridge.core.config import DdsConfig, load_robot_config
 from firmware_bridge.core.step_types import Report
+from firmware_bridge.dds.bus import DDS_ERRORS, Bus, take_each
 from firmware_bridge.unitree import robot_link
-from firmware_bridge.unitree.dds import DDS_ERRORS, Bus, take_each
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.messages.idl import (
     Request_,

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from firmware_bridge.core.config import DdsConfig
-from firmware_bridge.unitree.dds import Bus
+from firmware_bridge.dds.bus import Bus
 from firmware_bridge.unitree.messages.idl import Request_
 
 pytestmark = pytest.mark.process
@@ -18,8 +18,8 @@ _LISTENER = """
 import re, sys, time
 from pathlib import Path
 from firmware_bridge.core.config import DdsConfig
-from firmware_bridge.unitree.dds import Bus
-from firmware_bridge.unitree.messages.binding import has_reader
+from firmware_bridge.dds.bus import Bus
+from firmware_bridge.dds.binding import has_reader
 from firmware_bridge.unitree.messages.idl import Request_
 bus = Bus(DdsConfig(int(sys.argv[1]), "lo", ("127.0.0.1",)))
 for line in sys.stdin:

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from firmware_bridge.core.config import DdsConfig, load_robot_config
 from firmware_bridge.core.robot_state import CameraError, DdsError, RobotState
+from firmware_bridge.dds.bus import Bus, domain_xml
 from firmware_bridge.unitree.client import Go2Reader
-from firmware_bridge.unitree.dds import Bus, domain_xml
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.messages.idl import (
     RequestIdentity_,
@@ -250,7 +250,7 @@ def test_a_client_that_leaves_is_not_a_malformed_request(bus: Bus, dds_domain: i
     server = ServiceServer(bus, "leaving")
     code = (
         "from firmware_bridge.core.config import DdsConfig\n"
-        "from firmware_bridge.unitree.dds import Bus\n"
+        "from firmware_bridge.dds.bus import Bus\n"
         "from firmware_bridge.unitree.rpc import RpcClient\n"
         f"bus = Bus(DdsConfig({dds_domain}, 'lo', ('127.0.0.1',)))\n"
         "RpcClient(bus, 'leaving').call(1001, timeout_s=20)\n"

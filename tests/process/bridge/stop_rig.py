@@ -15,8 +15,8 @@ import pytest
 from cyclonedds.domain import DomainParticipant
 
 from firmware_bridge.client import BridgeClient, BridgeStatus, BridgeUnavailable
+from firmware_bridge.dds.bus import Bus
 from firmware_bridge.operate import operate
-from firmware_bridge.unitree.dds import Bus
 from firmware_bridge.unitree.messages import ids
 from tests.support.processes import GO2_SIM, REPOSITORY, Running, running, wait_for
 from tests.support.robot.fake_go2 import FakeGo2

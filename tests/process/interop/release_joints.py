@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 
 from firmware_bridge.core.config import DdsConfig
-from firmware_bridge.unitree.dds import Bus
+from firmware_bridge.dds.bus import Bus
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.rpc import RpcClient
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from firmware_bridge.core.config import BridgeConfig, LimitsConfig, SafetyConfig
+from firmware_bridge.core.config import BridgeConfig, LimitsConfig, SafetyConfig, load_robot_config
 from firmware_bridge.core.link import Arm, BridgeStatus, Velocity
-from firmware_bridge.core.robot_state import RobotState
+from firmware_bridge.core.robot_state import BatteryState, RobotState
 from firmware_bridge.core.rules import BridgeCore
-from firmware_bridge.core.step_types import Call, Inputs, Move, Outputs, Report
+from firmware_bridge.core.step_types import Identify, Inputs, Move, Outputs, Report, Request, Stand, StopMotion
 from firmware_bridge.unitree.messages import ids
+from firmware_bridge.unitree.table import robot_table
+from tests.support.processes import GO2_SIM
 
 MS = 1_000_000
 BRIDGE = BridgeConfig(Path("/nowhere/bridge.sock"))
@@ -18,6 +20,7 @@ LIMITS = LimitsConfig(
     vx_min_mps=-0.4, vx_max_mps=0.8, vy_max_mps=0.3, wz_max_radps=1.0, accel_mps2=2.0, alpha_radps2=4.0
 )
 SAFETY = SafetyConfig()
+TABLE = robot_table(load_robot_config(GO2_SIM))
 ZERO = Move(0.0, 0.0, 0.0)
 STILL = RobotState(
     0, (0.0, 0.0, 0.0), 0.0, 0.0, 0.0, ids.MODE_BALANCE_STAND, 0, robot_stamp_ns=0, position_z_m=0.3, roll_rad=0.0,
@@ -44,10 +47,10 @@ class Bench:
     asleep_ns: int = 0
     safety: SafetyConfig = SAFETY
     latch: str = ""
-    written: list[tuple[int, Move | Call]] = field(default_factory=list)
+    written: list[tuple[int, Request]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.core = BridgeCore(BRIDGE, LIMITS, self.safety, self.now_ns, latch=self.latch)
+        self.core = BridgeCore(BRIDGE, LIMITS, self.safety, TABLE, self.now_ns, latch=self.latch)
         self.asked = False
 
     def step(
@@ -57,13 +60,13 @@ class Bench:
         if self.mode is not None:
             state = replace(STILL, received_ns=self.now_ns, mode=self.mode, **self.robot)
             reported = {"state": state, **reported}
-        reported = {"battery_percent": self.battery, **reported}
-        self.battery = reported["battery_percent"]  # type: ignore[assignment]
+        if self.battery is not None:
+            reported = {"battery": BatteryState(self.now_ns, self.battery, 29.0, 1.0), **reported}
         if self.asked:
             reported = {"version": self.version, **reported}
         inputs = Inputs(messages, self.client, Report(**reported), operator, self.estop, self.asleep_ns, shutdown)
         outputs = self.core.step(inputs, self.now_ns)
-        asked = Call(ids.API_VERSION)
+        asked = Identify()
         self.asked = asked in outputs.requests
         self.written += [(self.now_ns, request) for request in outputs.requests if request != asked]
         return outputs
@@ -111,4 +114,6 @@ class Bench:
         return [request for _, request in self.written if isinstance(request, Move)]
 
     def calls(self) -> list[int]:
-        return [request.api_id for _, request in self.written if isinstance(request, Call)]
+        """API ids of the requests that are not velocities."""
+        steps = (request for _, request in self.written if isinstance(request, (Stand, StopMotion)))
+        return [request.step if isinstance(request, Stand) else ids.STOP_MOVE for request in steps]

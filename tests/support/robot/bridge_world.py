@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 
 from firmware_bridge.core.link import Arm, Message, Release, Stop, Velocity
-from firmware_bridge.core.step_types import Call, Move, Outputs
+from firmware_bridge.core.step_types import Identify, Move, Outputs, Request, Stand
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.remote import StopKeys
 from tests.support.robot.bridge_bench import LIMITS, MS, SAFETY, ZERO, Bench
@@ -32,19 +32,23 @@ class WorldRobot:
         self._move_ns = self._ready_ns = self._now_ns = 0
         self._next_mode = self.mode
 
-    def take(self, requests: tuple[Move | Call, ...], now_ns: int) -> str | None:
+    def take(self, requests: tuple[Request, ...], now_ns: int) -> str | None:
         """Obey; the name of a request that is denied because another client holds the lease."""
         denied = None
         for request in requests:
             if isinstance(request, Move):
                 if not self.leased:
                     self._target_mps, self._move_ns = request.vx_mps, now_ns
-            elif self.leased and request.api_id != ids.API_VERSION:
-                denied = ids.SPORT_API_NAMES[request.api_id]
-            elif request.api_id == ids.STOP_MOVE:
+                continue
+            if isinstance(request, Identify):
+                continue
+            step = request.step if isinstance(request, Stand) else ids.STOP_MOVE
+            if self.leased:
+                denied = ids.SPORT_API_NAMES[step]
+            elif step == ids.STOP_MOVE:
                 self._target_mps = 0.0
-            elif request.api_id in _STANDING_UP:
-                up = ids.MODE_JOINT_LOCK if request.api_id == ids.STAND_UP else ids.MODE_BALANCE_STAND
+            elif step in _STANDING_UP:
+                up = ids.MODE_JOINT_LOCK if step == ids.STAND_UP else ids.MODE_BALANCE_STAND
                 self._next_mode, self._ready_ns = up, now_ns + 1000 * MS
         return denied
 
@@ -224,7 +228,7 @@ class World:
     ) -> None:
         rules, now_ns, status = self.rules, self.bench.now_ns, outputs.status
         moves = [request for request in outputs.requests if isinstance(request, Move)]
-        calls = {request.api_id for request in outputs.requests if isinstance(request, Call)}
+        calls = {request.step for request in outputs.requests if isinstance(request, Stand)}
         moves_robot = bool(calls & _STANDING_UP) or any(move != ZERO for move in moves)
         assert not (stop and moves_robot), "a command that moves the robot in the step of an emergency stop"
         assert not (danger and any(move != ZERO for move in moves)), "motion in spite of a danger"

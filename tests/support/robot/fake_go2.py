@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware_bridge.core.config import DdsConfig
-from firmware_bridge.unitree.dds import Bus
+from firmware_bridge.dds.bus import Bus
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.messages.idl import SportModeState_, WirelessController_
 from firmware_bridge.unitree.messages.idl_low import LowState_

@@ -1,6 +1,6 @@
 """Low command message, for the simulated robot only: code that commands a real robot must not be able to decode it.
 
-Type and member names are those of the wire; octets: see firmware_bridge/unitree/messages/binding.py.
+Type and member names are those of the wire; octets: see firmware_bridge/dds/binding.py.
 """
 
 # ruff: noqa: N801 - the names are the wire's type names
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import cyclonedds.idl.types as t
 from cyclonedds.idl import IdlStruct
 
-from firmware_bridge.unitree.messages.binding import Octet
+from firmware_bridge.dds.binding import Octet
 
 if TYPE_CHECKING:
     Octets2 = Sequence[int]

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from cyclonedds.sub import DataReader
 
-from firmware_bridge.unitree.dds import DDS_ERRORS, Bus, take_each
+from firmware_bridge.dds.bus import DDS_ERRORS, Bus, take_each
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.messages.idl import Request_, RequestIdentity_, Response_, ResponseHeader_, ResponseStatus_
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from firmware_bridge.unitree.dds import Bus, take_each
+from firmware_bridge.dds.bus import Bus, take_each
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.messages.idl import SportModeState_
 from firmware_bridge.unitree.report import robot_state

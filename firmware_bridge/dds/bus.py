@@ -16,7 +16,7 @@ from cyclonedds.topic import Topic
 
 from firmware_bridge.core.config import DdsConfig
 from firmware_bridge.core.robot_state import DdsError
-from firmware_bridge.unitree.messages.binding import take_undecoded
+from firmware_bridge.dds.binding import take_undecoded
 
 # Everything a hostile or foreign sample can make the pure-Python CDR decoder raise.
 DECODE_ERRORS: Final = (struct.error, ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError)

@@ -1,0 +1,1 @@
+"""The MAVLink protocol of rovers with PX4 or ArduPilot, as the bridge speaks it."""
