@@ -111,6 +111,7 @@ class RobotConfig:
             needed, given = table in LINKS[self.protocol], getattr(self, table) is not None
             require(given or not needed, f"missing table [{table}]; protocol {self.protocol} needs it")
             require(needed or not given, f"unexpected table [{table}]; protocol {self.protocol} does not use it")
+        self.camera.check_protocol(self.protocol)
         for key, (walking, fastest) in FASTEST[self.protocol].items():
             value: float = getattr(self.limits, key)
             permitted = fastest if self.safety.above_walking_speed else walking
