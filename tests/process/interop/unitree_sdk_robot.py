@@ -1,4 +1,4 @@
-"""A robot on the maker's own Python SDK, unmodified: its RPC server, lease server and publishers, and a point for a body.
+"""A robot on the maker's own Python SDK, unmodified: its RPC server, lease server and publishers; a point is its body.
 
 usage: unitree_sdk_robot.py DOMAIN INTERFACE TRACE. Run by test_interop_unitree_sdk_robot.py; imports nothing of ours.
 Every request becomes a JSON line in TRACE. A line on stdin is a command: "silent" and "report" stop and start the
