@@ -192,7 +192,9 @@ def _build_steps(args: argparse.Namespace, system: System, prefix: Path, pip: li
     def pin() -> None:
         pinned.write_text(f"{BINDING} --hash=sha256:{BINDING_SHA256}\n")
 
-    words = [*pip, "--no-build-isolation", "--no-binary", "cyclonedds", "--no-deps", "-r", str(pinned)]
+    # pip 23.1 and newer keep what they have compiled: that of an earlier release leads to that release's own C library.
+    words = [*pip, "--no-cache-dir", "--no-build-isolation", "--no-binary", "cyclonedds", "--no-deps"]
+    words += ["-r", str(pinned)]
     steps += [
         tools,
         Step(f"pin {BINDING} to its hash", (), {}, pin),

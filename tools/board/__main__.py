@@ -15,7 +15,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -75,8 +75,8 @@ def _copy(args: argparse.Namespace) -> tuple[str, str]:
     They differ in their build tag only, which is enough for another release.
     """
     folder = args.root / INPUT.lstrip("/")
-    for old in (folder, args.root / HOME.lstrip("/"), args.root / INSTALLER.lstrip("/")):
-        shutil.rmtree(old, ignore_errors=True)
+    for old in (INPUT, INSTALLER, HOME, "/root/.cache"):  # pip's downloads: a new board has none
+        shutil.rmtree(args.root / old.lstrip("/"), ignore_errors=True)
     shutil.copytree(args.artifacts, folder / "artifacts")
     shutil.copy(args.flight, folder / "flight.mcap")
     shutil.copy(REPOSITORY / "constraints.txt", folder / "constraints.txt")
@@ -95,7 +95,8 @@ def _steps(args: argparse.Namespace, wheel: str, next_wheel: str) -> Iterator[di
     """Run one step after another; each gives its name, whether it passed, seconds and what it found."""
     for command in (*journey.installation(wheel), *journey.use(args.replay_to)):
         yield _command(args, command)
-    yield _drive(args)
+    yield _drive(args, "edge-bridge drives", board_drive.drive)
+    yield _drive(args, "edge-run, as far as an emulated processor lets it", board_drive.attempt_run)
     for command in journey.update(next_wheel):
         yield _command(args, command)
 
@@ -113,14 +114,14 @@ def _command(args: argparse.Namespace, command: journey.Command) -> dict[str, An
     return _note(args.out, command.name, fault, done.wall_s, {**found, "output": lines[-LINES:]})
 
 
-def _drive(args: argparse.Namespace) -> dict[str, Any]:
+def _drive(args: argparse.Namespace, name: str, drive: Callable[[Path, Path, int], dict[str, Any]]) -> dict[str, Any]:
     started_s = time.monotonic()
-    fault, found = None, {}
+    fault, found = None, dict[str, Any]()
     try:
-        found = board_drive.drive(args.root, args.out, args.domain)
+        found = drive(args.root, args.out, args.domain)
     except (board_drive.DriveError, subprocess.SubprocessError) as error:
         fault = str(error)
-    return _note(args.out, "edge-bridge drives", fault, round(time.monotonic() - started_s, 1), found)
+    return _note(args.out, name, fault, round(time.monotonic() - started_s, 1), found)
 
 
 def _note(out: Path, name: str, fault: str | None, wall_s: float, found: dict[str, Any]) -> dict[str, Any]:

@@ -15,6 +15,10 @@ INPUT: Final = "/root/input"  # what a user copies to the board
 INSTALLER: Final = "/root/installer"
 ROBOT_FILE: Final = "/etc/tic-vla-edge/go2.toml"
 QUIET: Final = ("cpuinfo", "cpuid_info")  # ONNX Runtime about the emulated processor
+_WITHOUT_1: Final = (
+    f"mv {HOME}/releases/1 /opt/aside && {BIN}/edge-run --help && {BIN}/edge-install dds;"
+    f" code=$?; mv /opt/aside {HOME}/releases/1; exit $code"
+)
 _IMPORT: Final = re.compile(r"import time:\s+(\d+) \|\s+\d+ \|\s+(\S+)")
 _MOST: Final = 10
 
@@ -99,6 +103,7 @@ def update(next_wheel: str) -> tuple[Command, ...]:
         Command("edge-install board --dry-run, second wheel", (*board(next_wheel), "--dry-run"), current=1),
         Command("edge-install board, second wheel", board(next_wheel), prints="current is release 2", current=2),
         Command("edge-run --help of release 2", (f"{BIN}/edge-run", "--help"), prints="usage: edge-run"),
+        Command("release 2 without release 1", ("sh", "-c", _WITHOUT_1), prints="nothing to do", current=2),
         Command("edge-install rollback --dry-run", (install, "rollback", "--dry-run"), "releases/1", current=2),
         Command("edge-install rollback", (install, "rollback"), prints="current is release 1", current=1),
         Command("edge-run --help of release 1", (f"{BIN}/edge-run", "--help"), prints="usage: edge-run"),

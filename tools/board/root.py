@@ -21,7 +21,7 @@ TOOLS: Final = {"debootstrap": "debootstrap", "qemu-aarch64-static": "qemu-user-
 BINFMT: Final = Path("/proc/sys/fs/binfmt_misc")
 HANDLER: Final = Path("/usr/lib/binfmt.d/qemu-aarch64.conf")
 _STAMP: Final = "etc/tic-vla-edge-root"
-_ENVIRONMENT: Final = {
+ENVIRONMENT: Final = {
     "DEBIAN_FRONTEND": "noninteractive",
     "HOME": "/root",
     "LC_ALL": "C.UTF-8",
@@ -106,7 +106,7 @@ class Ended:
 
 def inside(root: Path, words: Sequence[str]) -> str:
     """Run a command in the root and return its output. Raises RootError."""
-    return run(["chroot", str(root), *words], _ENVIRONMENT)
+    return run(["chroot", str(root), *words], ENVIRONMENT)
 
 
 def ended(root: Path, words: Sequence[str]) -> Ended:
@@ -114,7 +114,7 @@ def ended(root: Path, words: Sequence[str]) -> Ended:
     started_s = time.monotonic()
     with tempfile.TemporaryFile() as file:
         process = subprocess.Popen(
-            ["chroot", str(root), *words], env=_ENVIRONMENT, stdin=subprocess.DEVNULL, stdout=file, stderr=file
+            ["chroot", str(root), *words], env=ENVIRONMENT, stdin=subprocess.DEVNULL, stdout=file, stderr=file
         )
         _, status, usage = os.wait4(process.pid, 0)
         process.returncode = code = os.waitstatus_to_exitcode(status)

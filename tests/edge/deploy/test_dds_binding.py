@@ -90,6 +90,14 @@ def test_arm64_compiles_the_pinned_source_against_the_packages(tmp_path: Path) -
     assert (tmp_path / "prefix/lib/libddsc.so").resolve().name == "libddsc.so.0.10.2"
 
 
+def test_what_another_release_has_compiled_is_not_taken_from_pips_cache(tmp_path: Path) -> None:
+    machine = Machine(tmp_path / "usr")
+    install_library(tmp_path / "usr")
+    install(machine, tmp_path)
+    (compiled,) = [words for words in machine.commands if "--no-build-isolation" in words]
+    assert "--no-cache-dir" in compiled  # its path to the C library is compiled in
+
+
 def test_a_second_call_after_a_broken_one_continues(tmp_path: Path) -> None:
     install_library(tmp_path / "usr")
     assert install(Machine(tmp_path / "usr", fails_with="error: x"), tmp_path)[0] == 1
