@@ -13,6 +13,12 @@ WORKERS ?= 2
 PYTEST := $(BIN)/python -m pytest
 PARALLEL := OMP_NUM_THREADS=1 $(PYTEST) -n $(WORKERS) --dist loadfile
 PROCESS_FILES = $(shell grep -rlF --include='test_*.py' mark.process tests)
+# Both kinds of test share a folder, so that the model is exported once. $(1): the tests' name, $(2): options, $(3): marker.
+tiers = @folder=$$(mktemp -d) && trap 'rm -rf "$$folder"' EXIT && export EDGE_TEST_FOLDER="$$folder" && \
+	echo "== $(1) tests, $(WORKERS) at a time" && \
+	$(PARALLEL) $(2) -m "$(3)not process" && \
+	echo "== $(1) tests of processes, one at a time" && \
+	$(PYTEST) $(2) -m "$(3)process and not repeated" $(PROCESS_FILES)
 # Tests start hundreds of processes; without compiled modules on the disk each would compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
@@ -23,7 +29,7 @@ help:
 	@echo "make demos  the demo with ten seeds (about 15 min); out/demos/SEED/report.html"
 	@echo "make nano   train the shipped model from nothing into out/nano-run (hours; Ctrl-C and again goes on)"
 	@echo "make faults inject every fault into real processes, some 230 times (about 15 min), and write out/faults/"
-	@echo "make test   lint, type-check and run the fast tests (5 min on 2 cores)"
+	@echo "make test   lint, type-check and run the fast tests (less than 5 min on 2 cores)"
 	@echo "make test-all     lint, type-check and run every test (about 15 min on 2 cores)"
 	@echo "make test-slow    the tests that 'make test' leaves out"
 	@echo "make test-random  the property tests with a random seed, which is printed; SEED=N repeats one"
@@ -72,16 +78,10 @@ lint: .venv/.test-installed
 	$(BIN)/mypy
 
 test: lint
-	@echo "== fast tests, $(WORKERS) at a time"
-	$(PARALLEL) -m "not slow and not process"
-	@echo "== fast tests of processes, one at a time"
-	$(PYTEST) -m "process and not slow and not repeated" $(PROCESS_FILES)
+	$(call tiers,fast,,not slow and )
 
 test-slow: .venv/.test-installed
-	@echo "== slow tests, $(WORKERS) at a time"
-	$(PARALLEL) --durations=15 -m "slow and not process"
-	@echo "== slow tests of processes, one at a time"
-	$(PYTEST) --durations=15 -m "slow and process and not repeated" $(PROCESS_FILES)
+	$(call tiers,slow,--durations=15,slow and )
 
 # Shrinking a failing example takes up to 5 minutes: longer than the usual time limit of a test.
 test-random: .venv/.test-installed
@@ -90,10 +90,7 @@ test-random: .venv/.test-installed
 	$(PARALLEL) -m "hypothesis and not process" --timeout 600 --hypothesis-profile=random --hypothesis-seed=$$seed
 
 test-all: lint
-	@echo "== all tests but those of processes, $(WORKERS) at a time"
-	$(PARALLEL) --durations=15 -m "not process"
-	@echo "== all tests of processes, one at a time"
-	$(PYTEST) --durations=15 -m "process and not repeated" $(PROCESS_FILES)
+	$(call tiers,all,--durations=15,)
 
 stops: .venv/.test-installed
 	$(PYTEST) -s -m repeated tests/process/bridge

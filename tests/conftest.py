@@ -13,11 +13,16 @@ from edge.artifacts.manifest import Artifacts, load_artifacts
 from export.core.cache import StageCache, open_cache
 from tests.support.processes import claimed_dds_domain, locked
 
-# `tests` gives the same examples in every run and does not shrink a failing one: shrinking may take five minutes.
-# `random` is what `make test-random` asks for; it prints its seed. How long an example takes is no evidence on a shared
-# machine.
+# `tests` gives the same few examples in every run and does not shrink a failing one: shrinking may take five minutes.
+# `random` is what `make test-random` asks for: more examples, with a seed that it prints. How long an example takes is
+# no evidence on a shared machine.
 settings.register_profile(
-    "tests", derandomize=True, deadline=None, print_blob=True, phases=(Phase.explicit, Phase.generate)
+    "tests",
+    max_examples=40,
+    derandomize=True,
+    deadline=None,
+    print_blob=True,
+    phases=(Phase.explicit, Phase.generate),
 )
 settings.register_profile("random", deadline=None, print_blob=True, database=None)
 settings.load_profile("tests")
@@ -25,7 +30,9 @@ settings.load_profile("tests")
 
 @pytest.fixture(scope="session")
 def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of this test run that all its workers share."""
+    """Folder of this test run that all its workers share, and with EDGE_TEST_FOLDER the tests of both kinds."""
+    if "EDGE_TEST_FOLDER" in os.environ:
+        return Path(os.environ["EDGE_TEST_FOLDER"])
     folder = tmp_path_factory.getbasetemp()
     return folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
 
@@ -55,11 +62,11 @@ def cache(export_cache: Path) -> Iterator[StageCache]:
 @pytest.fixture(scope="session")
 def artifacts_dir(run_folder: Path) -> Path:
     """The `nano` artifacts, exported by the real command: once in a run, by the worker that needs them first."""
-    from export.cli import main
-
     out = run_folder / "artifacts" / "nano"
     with locked(run_folder / "artifacts.lock", wait=True):
         if not out.exists():
+            from export.cli import main  # here: it loads torch, which those who find the artifacts do without
+
             assert main(["--target", "cpu", "--model", "nano", "--random-weights", "0", "--out", str(out)]) == 0
     return out
 

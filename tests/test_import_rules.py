@@ -126,7 +126,10 @@ def test_importing_it_pulls_in_neither_torch_nor_pybullet(module: str) -> None:
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
-@pytest.mark.parametrize("module", ["edge.run.command", "export.evaluation.gates", "calib.power", "tools.bench.tick"])
+SLOW_IMPORTS = [pytest.param(name, marks=pytest.mark.slow) for name in ("export.evaluation.gates", "tools.bench.tick")]
+
+
+@pytest.mark.parametrize("module", ["edge.run.command", "calib.power", *SLOW_IMPORTS])
 def test_onnx_runtime_is_told_to_keep_no_telemetry_before_it_is_imported(module: str) -> None:
     code = (
         f"import os, sys; os.environ.pop('ORT_DISABLE_TELEMETRY', None); import {module}; names = list(sys.modules); "

@@ -198,6 +198,7 @@ def test_a_dead_camera_process_ends_the_robot_with_an_error(dds_domain: int, tmp
         assert "the camera process died" in started.stderr()
 
 
+@pytest.mark.slow
 def test_the_camera_process_does_not_outlive_its_parent(dds_domain: int, tmp_path: Path) -> None:
     with running("sim_hil.hil.command", *hil_arguments(dds_domain), folder=tmp_path) as started:
         camera = _camera_pid(started.pid)

@@ -24,9 +24,10 @@ from edge.inference.graph import Graph
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
 from edge.state.switches import Decoding, RecoverySwitch
-from export.cli import main
+from export.model.config import PRESETS
+from export.model.network import build
 from export.targets.file import load_target
-from tests.support.artifact_directory import edit_manifest, flip_bit, replace_file
+from tests.support.artifact_directory import edit_manifest, flip_bit, replace_file, write_artifacts
 
 
 @pytest.fixture
@@ -231,11 +232,9 @@ def test_a_graph_that_onnx_runtime_does_not_take_is_refused_when_opened(copy: Pa
 @pytest.fixture(scope="module")
 def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """`nano` with its encoder's weights in a data file, as large graphs have them."""
-    out = tmp_path_factory.mktemp("mapped") / "nano"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("export.graphs.build.SINGLE_FILE_BYTES", 5_000_000)
-        assert main(["--target", "cpu", "--random-weights", "0", "--no-cache", "--out", str(out)]) == 0
-    return out
+        return write_artifacts(build(PRESETS["nano"], 0), tmp_path_factory.mktemp("mapped"))
 
 
 @pytest.fixture
@@ -247,10 +246,11 @@ DATA = "vision_encoder.onnx.data"
 
 
 @pytest.mark.slow
-def test_weights_in_a_data_file_compute_the_same(mapped: Path, artifacts_dir: Path) -> None:
-    assert (mapped / DATA).exists() and not (artifacts_dir / DATA).exists()
+def test_weights_in_a_data_file_compute_the_same(mapped: Path, tmp_path: Path) -> None:
+    whole = write_artifacts(build(PRESETS["nano"], 0), tmp_path)
+    assert (mapped / DATA).exists() and not (whole / DATA).exists()
     frame = np.random.default_rng(0).integers(0, 256, (1, 128, 128, 3)).astype(np.uint8)
-    inside, outside = (Policy(load_artifacts(d)).encode(frame) for d in (artifacts_dir, mapped))
+    inside, outside = (Policy(load_artifacts(d)).encode(frame) for d in (whole, mapped))
     np.testing.assert_array_equal(inside, outside)
 
 

@@ -166,7 +166,7 @@ def log(driven: list[Record], tmp_path: Path, artifacts_dir: Path) -> Log:
     return Log(driven, tmp_path / "flight.mcap", artifacts_dir)
 
 
-@pytest.mark.parametrize("mode", [Mode.ASYNC, Mode.NO_REASONING], ids=lambda mode: mode.value)
+@pytest.mark.parametrize("mode", [Mode.ASYNC, pytest.param(Mode.NO_REASONING, marks=pytest.mark.slow)])
 def test_a_run_of_both_loops_is_replayed_bit_for_bit(artifacts_dir: Path, tmp_path: Path, mode: Mode) -> None:
     recorder = Recorder(tmp_path / "flight.mcap")
     drive(load_artifacts(artifacts_dir), recorder, mode)

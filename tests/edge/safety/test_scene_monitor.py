@@ -166,7 +166,7 @@ def stopped(buffers: int = 1) -> tuple[Drive, list[Picture]]:
     return robot, stale
 
 
-@pytest.mark.parametrize("buffers", [1, 2, 8])
+@pytest.mark.parametrize("buffers", [1, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 8))])
 def test_a_robot_that_stopped_for_a_frozen_picture_stands_as_long_as_it_is_frozen(buffers: int) -> None:
     robot, stale = stopped(buffers)
     assert all(robot.run(300, 0.0, shown=lambda index: robot.noisy(stale[index % buffers])))
@@ -183,7 +183,7 @@ def test_a_frozen_verdict_ends_a_second_after_the_picture_is_live_again_and_its_
 def test_a_frozen_picture_before_a_robot_that_stands_is_no_fault_until_it_drives() -> None:
     robot = drive()
     frozen = robot.live()
-    assert not any(robot.run(600, 0.0, shown=lambda _index: robot.noisy(frozen)))
+    assert not any(robot.run(300, 0.0, shown=lambda _index: robot.noisy(frozen)))
     went_m, _ = robot.until_found(lambda index: robot.noisy(frozen), 0.3)
     assert went_m <= 0.33
 

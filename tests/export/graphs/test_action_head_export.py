@@ -70,6 +70,7 @@ def nodes(model: TicVla, directory: Path) -> list[onnx.NodeProto]:
     ],
     ids=str,
 )
+@pytest.mark.slow
 @pytest.mark.parametrize("head", OTHERS)
 def test_every_variant_of_a_head_plans_as_the_network_does(tmp_path: Path, head: str, change: dict) -> None:
     assert check(lively(with_head(TINY, head, **change), 2), tmp_path, EXACT, "fused") < 1e-4
@@ -82,6 +83,7 @@ BOUNDS = {"fp32": 0.02, "fp16": 0.02, "int8-b32": 0.1, "int8": 0.2, "int4-b32": 
 COMBINATIONS = [(precision, half) for precision in BOUNDS for half in (False, True) if not (half and "-b" in precision)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("precision", "half"), COMBINATIONS)
 @pytest.mark.parametrize("head", OTHERS)
 def test_every_precision_runs_and_is_near(tmp_path: Path, head: str, precision: str, half: bool) -> None:
@@ -89,7 +91,7 @@ def test_every_precision_runs_and_is_near(tmp_path: Path, head: str, precision: 
     assert check(lively(with_head(TINY, head)), tmp_path, Precision(precision), "fused", half=half) < BOUNDS[precision]
 
 
-@pytest.mark.parametrize("precision", ["fp32", "fp16", "int8"])
+@pytest.mark.parametrize("precision", ["fp32", *(pytest.param(p, marks=pytest.mark.slow) for p in ("fp16", "int8"))])
 @pytest.mark.parametrize("head", OTHERS)
 def test_the_plain_form_has_standard_operators_only(tmp_path: Path, head: str, precision: str) -> None:
     assert check(lively(with_head(TINY, head)), tmp_path, Precision(precision), "plain") < BOUNDS[precision]
@@ -98,6 +100,7 @@ def test_the_plain_form_has_standard_operators_only(tmp_path: Path, head: str, p
     onnx.checker.check_model(proto, full_check=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("head", OTHERS)
 def test_rounding_in_pytorch_is_the_graphs_rounding(tmp_path: Path, head: str) -> None:
     """The search for a precision runs PyTorch with the layers it names rounded: weights alone must agree closely."""

@@ -15,7 +15,7 @@ from export.model.config import PRESETS, LanguageConfig
 from export.model.network import TicVla
 from tests.support.export.internvl import CONFIG, hf_model, original_tensors, write_directory
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 FRAMES = 3
 LAYOUTS = ("original", "hf", "hf shards", "lightning", "hf tied")
 

@@ -39,6 +39,7 @@ def test_text_is_cut_as_by_tiktoken(tokenizer: Tokenizer) -> None:
         assert tokenizer.decode(ids) == unicodedata.normalize("NFC", text)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("token", "number"),
     [

@@ -94,6 +94,7 @@ def test_only_what_the_machine_stood_still_inside_the_window_is_granted() -> Non
         check_stop_latency(26, bound_ns=9, since_ns=5, host=host)
 
 
+@pytest.mark.slow
 def test_the_robot_comes_to_a_stand(rig: Rig) -> None:
     walk_then(rig, signal.SIGKILL)
     wait_for(lambda: rig.speed_mps() < 0.1, 20, "the robot to stand")

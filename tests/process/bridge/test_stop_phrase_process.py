@@ -201,6 +201,7 @@ def test_without_a_bridge_that_this_user_can_reach_the_runner_stops_the_robot_it
         check_stands(stack, host, ended_ns)
 
 
+@pytest.mark.slow
 def test_a_stop_phrase_while_the_robot_stands_up_ends_the_arming(stack: Stack) -> None:
     with stack.drive(ready="edge-run") as runner:
         wait_for(stack.instructions.exists, 60, "the instruction socket")

@@ -14,7 +14,7 @@ from sim_hil.benchmark.language.openings import Frame
 from sim_hil.benchmark.policies.expert_route import RoutePlanner
 from sim_hil.benchmark.suite.robots import footprint_m, max_step_m
 from tests.support.train.training_scenarios import all_scenarios, progress_of, scenarios
-from tools.train.config.collect import KINDS
+from tools.train.config.collect import CORRIDOR, KINDS
 from tools.train.drives.progress_labels import RouteProgress
 from tools.train.drives.scenarios import Scenario
 
@@ -44,7 +44,7 @@ def _said(progress: RouteProgress, points: Points) -> list[Progress]:
 
 
 @pytest.mark.parametrize("way", [_told_way, _expert_way])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [CORRIDOR, *(pytest.param(k, marks=pytest.mark.slow) for k in KINDS if k != CORRIDOR)])
 def test_a_robot_that_takes_the_kth_opening_has_passed_k_less_one(kind: str, way) -> None:  # type: ignore[no-untyped-def]
     for scenario in scenarios(kind):
         said = _said(progress_of(scenario), way(scenario))
@@ -62,6 +62,7 @@ def test_progress_never_falls_back_along_the_way(way) -> None:  # type: ignore[n
         assert said == sorted(said), scenario.episode.id
 
 
+@pytest.mark.slow
 def test_it_begins_with_the_first_turn_and_ends_on_the_last_leg() -> None:
     for scenario in all_scenarios():
         progress, steps = progress_of(scenario), len(scenario.route.steps)
@@ -69,6 +70,7 @@ def test_it_begins_with_the_first_turn_and_ends_on_the_last_leg() -> None:
         assert progress.at(SE2(*scenario.task.goal, 0.0)) == Progress(steps + 1, steps, 0)
 
 
+@pytest.mark.slow
 def test_a_robot_that_misses_the_turn_keeps_it_as_next_and_counts_the_opening() -> None:
     checked = 0
     for scenario in all_scenarios():
@@ -88,12 +90,14 @@ def test_a_robot_that_misses_the_turn_keeps_it_as_next_and_counts_the_opening() 
     assert checked >= 2
 
 
+@pytest.mark.slow
 def test_a_pose_off_the_floor_belongs_somewhere_too() -> None:
     for scenario in all_scenarios():
         for xy in ((1e3, 1e3), (-1e3, 0.0)):
             assert progress_of(scenario).at(SE2(*xy, 0.0)).steps == len(scenario.route.steps)
 
 
+@pytest.mark.slow
 def test_the_way_left_shrinks_metre_by_metre() -> None:
     for scenario in all_scenarios():
         progress, points = progress_of(scenario), _told_way(scenario)

@@ -51,17 +51,20 @@ def test_a_reserved_layout_is_refused(kind: str, seed: int) -> None:
         Site(kind, seed)
 
 
+@pytest.mark.slow
 def test_no_seed_of_a_crowd_is_the_benchmarks() -> None:
     assert max(episode.seed for episode in SUITE) < FIRST_SEED
     assert all(scenario.episode.seed >= FIRST_SEED for scenario in all_scenarios())
 
 
+@pytest.mark.slow
 def test_no_start_or_goal_is_the_benchmarks() -> None:
     held = {(episode.start, episode.goal_xy) for episode in SUITE}
     assert not held & {(scenario.episode.start, scenario.episode.goal_xy) for scenario in all_scenarios()}
     assert not {start for start, _ in held} & {scenario.episode.start for scenario in all_scenarios()}
 
 
+@pytest.mark.slow
 def test_no_wording_and_no_pattern_of_one_is_the_benchmarks() -> None:
     texts = [text for scenario in all_scenarios() for text in scenario.wordings]
     held = {text for episode in SUITE for text in episode.instructions}
@@ -87,12 +90,14 @@ def test_a_scenario_with_a_wording_or_a_crowd_of_the_benchmark_is_refused() -> N
 # -- what a scenario is ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_every_scenario_has_wordings_enough_and_all_of_them_true() -> None:
     for scenario in all_scenarios():
         assert len(set(scenario.wordings)) >= LEAST_WORDINGS
         assert not [problem for text in scenario.wordings for problem in untrue(text, scenario.route)]
 
 
+@pytest.mark.slow
 def test_a_task_can_be_done_by_its_robot_and_ends_before_its_landmark() -> None:
     for scenario in all_scenarios():
         episode = scenario.episode

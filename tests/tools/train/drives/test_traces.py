@@ -119,7 +119,7 @@ def test_a_header_that_does_not_match_the_grammar_is_refused(wrong: dict[str, st
 # -- progress and plan -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [CORRIDOR, *(pytest.param(k, marks=pytest.mark.slow) for k in KINDS if k != CORRIDOR)])
 def test_the_plan_is_the_next_described_step_or_to_stop(kind: str) -> None:
     for scenario in scenarios(kind):
         tracer, steps = _tracer(scenario), scenario.route.steps
@@ -149,6 +149,7 @@ def test_a_robot_that_stands_before_a_person_waits() -> None:
     assert not _waits(tracer.trace(pose, *NOBODY, [(0.1, 0.0)]))
 
 
+@pytest.mark.slow
 def test_an_opening_that_counts_is_named_on_its_side_before_one_is_there() -> None:
     checked = 0
     for scenario in all_scenarios():
