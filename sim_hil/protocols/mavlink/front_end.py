@@ -169,7 +169,9 @@ class MavlinkFrontEnd(CameraFrontEnd):
             for key, value in message.to_dict().items()
             if key not in _NOT_TRACED and value and value == value  # MAVSDK fills unused fields with NaN
         )
-        return [ReceivedCommand(received_ns, "mavlink", number, name, f"station={station.system} {content}")]
+        velocity = (0.0, 0.0, 0.0) if wanted is None else (wanted[0], 0.0, wanted[1]) if moves else None
+        text = f"station={station.system} {content}"
+        return [ReceivedCommand(received_ns, "mavlink", number, name, text, velocity=velocity, source=station.system)]
 
     def publish(self, step: int, stamp_s: float) -> None:
         """Advance the rover's clock and send the messages that are due."""
