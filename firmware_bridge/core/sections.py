@@ -135,11 +135,15 @@ class LimitsConfig(Section):
 
 @dataclass(frozen=True)
 class CameraConfig(Section):
-    """Front camera: request rate, age of a frame when its answer arrives, timeout of a request."""
+    """Front camera: request rate, age of a frame when its answer arrives, timeout of a request.
+
+    `source`: "robot" for the camera service of the robot's own protocol, or the address of an HTTP stream of JPEGs.
+    """
 
     rate_hz: float = within_range(0, 60, above=True)
     latency_ms: float = within_range(0, 2000)
     timeout_ms: int = within_range(10, 10000)
+    source: str = "robot"
 
 
 @dataclass(frozen=True)
