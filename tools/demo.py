@@ -30,6 +30,7 @@ from edge.core.cli import (
 from export.checkpoint.load import shipped_weights
 from export.model.config import PRESETS
 from export.model.weights import CheckpointError
+from firmware_bridge.core.config import ConfigError, load_robot_config
 from reporting.progress import Progress
 from sim_hil.realtime.children import Child, Children, StepError
 from sim_hil.realtime.robots import BRIDGE_SOCKET, GO2, ROBOTS, RunAddress, StackRobot, StackRobotError, free_domain
@@ -94,6 +95,7 @@ class DemoOptions:
             "domain": self.domain,
             "robot": self.robot.name,
             "protocol": self.robot.protocol,
+            "bridge_growth": _bridge_growth(self.robot.file),
             "artifacts": self._artifacts_from_out(),
         }
 
@@ -111,6 +113,13 @@ class DemoOptions:
     def files(self) -> RunFiles:
         """Paths of the run's files."""
         return RunFiles(self.out, self.artifacts)
+
+
+def _bridge_growth(robot_file: Path) -> list[float]:
+    """Return by how much the bridge lets a command grow in one of its periods: m/s, m/s, rad/s."""
+    config = load_robot_config(robot_file)
+    speed, turn = (value / config.bridge.rate_hz for value in (config.limits.accel_mps2, config.limits.alpha_radps2))
+    return [speed, speed, turn]
 
 
 class TraceTail(LineTail):
@@ -309,7 +318,7 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]
     except KeyboardInterrupt:
         _print("interrupted, all processes ended")
         return EXIT_INTERRUPTED
-    except (StepError, StackRobotError, ReportError, CheckpointError, OSError) as error:
+    except (StepError, StackRobotError, ConfigError, ReportError, CheckpointError, OSError) as error:
         _print(str(error))
         return EXIT_CHECK_FAILED
     finally:

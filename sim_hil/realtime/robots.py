@@ -105,7 +105,7 @@ def _put(content: dict[str, Any], key: str, value: str | float) -> None:
     content[table][name] = int(value) if isinstance(before, int) and isinstance(value, str) else value
 
 
-_CAMERA: Final = ("camera.url", "http://127.0.0.1:{camera_port}/stream.mjpg")
+_CAMERA: Final = ("camera.source", "http://127.0.0.1:{camera_port}/stream.mjpg")
 _DOMAIN: Final = ("dds.domain", "{domain}")
 
 ROBOTS: Mapping[str, StackRobot] = MappingProxyType(
@@ -135,7 +135,7 @@ ROBOTS: Mapping[str, StackRobot] = MappingProxyType(
                 "ros2",
                 "carter_ros2_sim.toml",
                 ("--interface", "lo", "--domain={domain}"),
-                (_DOMAIN, _CAMERA),
+                (_DOMAIN, ("camera.source", "ros2:/camera/image/compressed")),
             ),
         )
     }

@@ -45,5 +45,12 @@ def test_commands_that_the_bridge_delays_or_that_look_like_the_last_are_left_out
     assert command_latencies_ms(ticks(FAST, second, second), arrivals((140.0, second))) == []
 
 
+def test_a_command_that_grows_within_one_period_of_the_bridge_is_matched() -> None:
+    grown = (0.54, 0.0, 0.3)
+    wire = arrivals((140.0, grown))
+    assert command_latencies_ms(ticks(FAST, grown, grown), wire, (0.04, 0.04, 0.08)) == [10.0]
+    assert command_latencies_ms(ticks(FAST, grown, grown), wire, (0.03, 0.03, 0.08)) == []
+
+
 def test_a_command_that_has_not_arrived_before_the_next_one_is_left_out() -> None:
     assert command_latencies_ms(ticks(FAST, SLOW, SLOW), arrivals((140.0, FAST), (240.0, SLOW), (250.0, None))) == []

@@ -53,7 +53,8 @@ def odometry_error_m(data: RunData) -> float | None:
 
 def command_latency_ms(data: RunData) -> Record:
     """Return n, p50, p99 and max of the time from a sent command to its arrival at the robot, ms."""
-    found = np.array(command_latencies_ms(data.log.ticks, data.trace.wire))
+    growth = data.settings.get("bridge_growth", (0.0, 0.0, 0.0))
+    found = np.array(command_latencies_ms(data.log.ticks, data.trace.wire, growth))
     if not len(found):
         return {"n": 0, "p50": None, "p99": None, "max": None}
     figures = {"p50": percentile(found, 50), "p99": percentile(found, 99), "max": float(found.max())}
