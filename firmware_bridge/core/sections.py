@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 REMOTE_KEYS: Final = (
     *("R1", "L1", "start", "select", "R2", "L2", "F1", "F2"),
@@ -39,13 +39,16 @@ def within_range(low: float, high: float, default: Any = MISSING, *, above: bool
 
 @dataclass(frozen=True)
 class Section:
-    """A table of the robot file, named like its class; it checks the fields declared by `within_range`."""
+    """A table of the robot file, named like its class or `table_name`; checks the fields declared by `within_range`."""
+
+    table_name: ClassVar[str] = ""
 
     def __post_init__(self) -> None:
         for each in (each for each in fields(self) if "range" in each.metadata):
             (low, high, above), value = each.metadata["range"], getattr(self, each.name)
             inside = low <= value <= high and not (above and value == low)
-            key = f"{type(self).__name__.removesuffix('Config').lower()}.{each.name}"
+            table = self.table_name or type(self).__name__.removesuffix("Config").lower()
+            key = f"{table}.{each.name}"
             require(inside, f"{key}: expected {low:g}..{high:g}, found {value}{speed_hint(each.name, value)}")
 
 
@@ -135,11 +138,15 @@ class LimitsConfig(Section):
 
 @dataclass(frozen=True)
 class CameraConfig(Section):
-    """Front camera: request rate, age of a frame when its answer arrives, timeout of a request."""
+    """Front camera: request rate, age of a frame when its answer arrives, timeout of a request.
+
+    `source`: "robot" for the protocol's own camera, or the address of an MJPEG stream.
+    """
 
     rate_hz: float = within_range(0, 60, above=True)
     latency_ms: float = within_range(0, 2000)
     timeout_ms: int = within_range(10, 10000)
+    source: str = "robot"
 
 
 @dataclass(frozen=True)
