@@ -13,13 +13,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+from firmware_bridge.can.buses import BusAddress, BusError, open_bus
+from firmware_bridge.can.frame import Frame
 from firmware_bridge.client_link import check_is_ours
 from firmware_bridge.core.config import ConfigError, runtime_dir
 from sim_hil.protocols.base import CameraFrontEnd, CommandLog, Vec3
 from sim_hil.protocols.camera_stream import CameraStream
 from sim_hil.protocols.can import frames
-from sim_hil.protocols.can.buses import BusAddress, BusError, BusLink, open_bus
-from sim_hil.protocols.can.frames import Frame, Received
+from sim_hil.protocols.can.buses import BusLink
+from sim_hil.protocols.can.frames import Received
 from sim_hil.protocols.can.node import CanNode
 from sim_hil.protocols.can.pty_line import PtyLine
 from sim_hil.protocols.can.shim import FaultPlan, FaultShim
