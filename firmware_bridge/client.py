@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import select
-import socket
 from pathlib import Path
 from typing import Final
 
@@ -20,15 +19,11 @@ from firmware_bridge.core.link import (
     decode,
     encode,
 )
-from firmware_bridge.peer import is_trusted_listener, peer_uid
+from firmware_bridge.peer import CONNECT_TIMEOUT_S, BridgeUnavailable, connect
 
 __all__ = ["BridgeClient", "BridgeStatus", "BridgeUnavailable"]
 
-_HELLO_TIMEOUT_MS: Final = 1000
-
-
-class BridgeUnavailable(RuntimeError):  # noqa: N818 - it names a state, not an error
-    """No bridge listens, it has another client, or its connection has closed; one line for the operator."""
+_HELLO_TIMEOUT_MS: Final = round(CONNECT_TIMEOUT_S * 1e3)
 
 
 class BridgeClient:
@@ -43,27 +38,7 @@ class BridgeClient:
     def __init__(self, socket_path: Path | str) -> None:
         """Connect and wait up to 1 s for the bridge's greeting. Raises BridgeUnavailable."""
         self._status: BridgeStatus | None = None
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        try:
-            self._socket.settimeout(_HELLO_TIMEOUT_MS / 1e3)  # a bridge that hangs accepts no connection
-            self._socket.connect(str(socket_path))
-            listener_uid = peer_uid(self._socket)
-        except PermissionError as error:
-            self._socket.close()
-            message = f"no permission for the bridge at {socket_path}; use sudo or join the socket's group"
-            raise BridgeUnavailable(message) from error
-        except OSError as error:
-            self._socket.close()
-            raise BridgeUnavailable(
-                f"no bridge listens at {socket_path} ({error.strerror}); start `edge-bridge --robot FILE.toml`"
-            ) from error
-        if not is_trusted_listener(Path(socket_path), listener_uid):
-            self._socket.close()
-            raise BridgeUnavailable(
-                f"{socket_path} belongs to user {listener_uid}, not to a bridge of this user's or the service's;"
-                " expected a folder that root has given to that user alone, such as /run/tic-vla-edge"
-            )
-        self._socket.setblocking(False)
+        self._socket = connect(Path(socket_path))
         poller = select.poll()
         poller.register(self._socket, select.POLLIN)
         status = None

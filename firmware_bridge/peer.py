@@ -1,4 +1,4 @@
-"""Decides which process a client accepts as the bridge at the other end of a local socket."""
+"""Connects a client to one of the bridge's local sockets, and decides which process it accepts as the bridge there."""
 
 from __future__ import annotations
 
@@ -12,6 +12,38 @@ from typing import Final
 
 _UCRED: Final = struct.Struct("3i")  # pid, uid, gid
 _OTHERS_WRITE: Final = stat.S_IWGRP | stat.S_IWOTH
+CONNECT_TIMEOUT_S: Final = 1.0
+"""A bridge that hangs accepts no connection; a client waits for so long, s."""
+
+
+class BridgeUnavailable(RuntimeError):  # noqa: N818 - it names a state, not an error
+    """No bridge listens, it has another client, or its connection has closed; one line for the operator."""
+
+
+def connect(path: Path) -> socket.socket:
+    """Return a connection to the bridge's socket at `path` that never waits. Raises BridgeUnavailable within 1 s."""
+    connected = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    try:
+        connected.settimeout(CONNECT_TIMEOUT_S)
+        connected.connect(str(path))
+        listener_uid = peer_uid(connected)
+    except PermissionError as error:
+        connected.close()
+        message = f"no permission for the bridge at {path}; use sudo or join the socket's group"
+        raise BridgeUnavailable(message) from error
+    except OSError as error:
+        connected.close()
+        raise BridgeUnavailable(
+            f"no bridge listens at {path} ({error.strerror}); start `edge-bridge --robot FILE.toml`"
+        ) from error
+    if not is_trusted_listener(path, listener_uid):
+        connected.close()
+        raise BridgeUnavailable(
+            f"{path} belongs to user {listener_uid}, not to a bridge of this user's or the service's;"
+            " expected a folder that root has given to that user alone, such as /run/tic-vla-edge"
+        )
+    connected.setblocking(False)
+    return connected
 
 
 def peer_uid(connected: socket.socket) -> int:

@@ -41,14 +41,18 @@ class CameraPoller:
         period_ns: int,
         timeout_s: float,
         latency_ns: int,
+        captured_ns: Callable[[], int | None] = lambda: None,
         on_frame: Callable[[Frame], None] | None = None,
         on_death: Callable[[str], None] = lambda why: None,
     ) -> None:
-        """`on_frame` is given every frame in the camera thread, after the control thread may see it.
+        """`captured_ns` returns the capture stamp of the picture requested last, None where its source has none.
+
+        `on_frame` is given every frame in the camera thread, after the control thread may see it.
 
         `on_death` takes, once and in that thread, why it has ended although it was not closed.
         """
         self._request = request
+        self._captured_ns = captured_ns
         self._on_frame = on_frame
         self._on_death = on_death
         self._image_px = image_px
@@ -96,12 +100,17 @@ class CameraPoller:
                 self.failures += 1
                 self.last_error = str(error)
                 continue
-            # The protocol carries no capture stamp: the answer's arrival less the camera's latency, and never before
-            # the request, since both known robots sample when asked. When an answer took much longer, its capture is
-            # unknown: as long ago as it can have been.
-            slow = arrived_ns - requested_ns > self._latency_ns + self._period_ns
-            stamp_ns = requested_ns if slow else max(requested_ns, arrived_ns - self._latency_ns)
+            stamp_ns = self._captured_ns()
+            if stamp_ns is None:
+                stamp_ns = self._estimate_stamp(requested_ns, arrived_ns)
             self.newest = frame = Frame(stamp_ns, pixels, jpeg)
             self.frames += 1
             if self._on_frame is not None:
                 self._on_frame(frame)
+
+    def _estimate_stamp(self, requested_ns: int, arrived_ns: int) -> int:
+        """Return the capture stamp of a picture whose source carries none: a robot that samples when asked."""
+        # The answer's arrival less the camera's latency, and never before the request. When an answer took much longer,
+        # its capture is unknown: as long ago as it can have been.
+        slow = arrived_ns - requested_ns > self._latency_ns + self._period_ns
+        return requested_ns if slow else max(requested_ns, arrived_ns - self._latency_ns)

@@ -59,9 +59,9 @@ class Ros2Config(Section):
         stops = 0 < self.base_timeout_ms <= LONGEST_BASE_TIMEOUT_MS
         require(
             stops or self.supervised,
-            f"ros2.base_timeout_ms: expected 1..{LONGEST_BASE_TIMEOUT_MS}, found {self.base_timeout_ms}: the base drives"
-            " on when the bridge dies; give the base a command timeout, or write ros2.supervised = true and keep a"
-            " person at the base's own emergency stop",
+            f"ros2.base_timeout_ms: expected 1..{LONGEST_BASE_TIMEOUT_MS}, found {self.base_timeout_ms}: the base"
+            " drives on when the bridge dies; give the base a command timeout, or write ros2.supervised = true and keep"
+            " a person at the base's own emergency stop",
         )
 
     def topic(self, name: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final
@@ -15,6 +16,23 @@ REMOTE_KEYS: Final = (
 VELOCITY_FRAMES: Final = ("odom", "body")
 OPERATOR_SUFFIX: Final = ".operator"  # of the second socket, for `edge-bridge stop`, `arm` and `status`
 OBSERVER_SUFFIX: Final = ".state"  # of the third socket, on which the bridge passes on the robot's reports
+CAMERA_SOURCES: Final = {
+    "http": "http://HOST:PORT/PATH of an MJPEG stream",
+    "v4l2": "v4l2:/dev/videoN or v4l2:/dev/v4l/...",
+    "gstreamer": "gstreamer:PIPELINE that ends in an appsink",
+    "ros2": "ros2:/TOPIC of sensor_msgs/CompressedImage",
+    "ros2raw": "ros2raw:/TOPIC of sensor_msgs/Image",
+}
+"""Values of camera.source other than "robot" by the part before the first colon, as messages describe them."""
+_TOPIC: Final = r"(/[A-Za-z_][A-Za-z0-9_]*)+"
+_ADDRESSES: Final = {
+    "http": r"//([A-Za-z0-9.-]+|\[[0-9A-Fa-f:.]+\])(:(?P<port>[0-9]{1,5}))?(/[!-\"$-~]*)?",
+    "v4l2": r"/dev/(video[0-9]{1,3}|v4l/[A-Za-z0-9_.:/-]+)",
+    "gstreamer": r"[ -~]+![ ]*appsink( [ -~]*)?",
+    "ros2": _TOPIC,
+    "ros2raw": _TOPIC,
+}
+"""What follows that colon."""
 MAX_SOCKET_PATH_BYTES: Final = 107  # sizeof(sockaddr_un.sun_path) less its NUL, unix(7)
 
 
@@ -135,11 +153,31 @@ class LimitsConfig(Section):
 
 @dataclass(frozen=True)
 class CameraConfig(Section):
-    """Front camera: request rate, age of a frame when its answer arrives, timeout of a request."""
+    """Front camera: request rate, age of a frame when it arrives, timeout of a request.
+
+    `source`: "robot" for pictures over the robot's own protocol, else one of CAMERA_SOURCES.
+    """
 
     rate_hz: float = within_range(0, 60, above=True)
     latency_ms: float = within_range(0, 2000)
     timeout_ms: int = within_range(10, 10000)
+    source: str = "robot"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        kind, _, address = self.source.partition(":")
+        found = re.fullmatch(_ADDRESSES.get(kind, "(?!)"), address)
+        valid = self.source == "robot" or (found and 0 < int(found.groupdict().get("port") or 80) < 65536)
+        expected = CAMERA_SOURCES.get(kind) or f"robot, {' or '.join(CAMERA_SOURCES.values())}"
+        require(bool(valid), f"camera.source: expected {expected}, found {self.source!r}")
+
+    def check_protocol(self, protocol: str) -> None:
+        """Raise ConfigError unless a robot of this protocol can have this source."""
+        own, kind = self.source == "robot", self.source.partition(":")[0]
+        others = f"protocol {protocol} carries no pictures; expected {' or '.join(CAMERA_SOURCES.values())}"
+        require(not own or protocol == "unitree", f"camera.source: {others}, found {self.source!r}")
+        ros = kind.startswith("ros2")
+        require(not ros or protocol == "ros2", f"camera.source: {kind} needs protocol ros2, found protocol {protocol}")
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from edge.deploy import units
-from firmware_bridge import client as client_module
 from firmware_bridge import operate as operate_module
+from firmware_bridge import peer as peer_module
 from firmware_bridge.bridge import main as bridge_main
 from firmware_bridge.client import BridgeClient, BridgeUnavailable
 from firmware_bridge.client_link import ClientLink, listen
@@ -135,7 +135,7 @@ class TestFolder:
 
     def test_a_listener_of_another_user_is_not_believed(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         with closing(ClientLink(path)):
-            monkeypatch.setattr(client_module, "peer_uid", lambda _: os.getuid() + 1)
+            monkeypatch.setattr(peer_module, "peer_uid", lambda _: os.getuid() + 1)
             with pytest.raises(BridgeUnavailable, match="not to a bridge of this user's"):
                 BridgeClient(path)
 
@@ -228,7 +228,7 @@ def deny(monkeypatch: pytest.MonkeyPatch, path: Path) -> None:
                 raise PermissionError(errno.EACCES, "Permission denied")
             real(self, address)
 
-    monkeypatch.setattr(client_module.socket, "socket", Socket)
+    monkeypatch.setattr(peer_module.socket, "socket", Socket)
 
 
 class TestCommandLine:

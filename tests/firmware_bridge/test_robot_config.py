@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from firmware_bridge.core.config import ConfigError, load_robot_config
+from firmware_bridge.core.config import CameraConfig, ConfigError, load_robot_config
 from tests.support.processes import GO2_SIM
 
 GO2 = GO2_SIM.with_name("go2.toml")
@@ -131,3 +131,71 @@ def test_the_shipped_files_stay_at_walking_speed_without_the_opt_in() -> None:
 def test_a_socket_path_the_system_cannot_bind_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="the system allows 107"):
         load_robot_config(GO2_SIM, socket=tmp_path / ("x" * 120))
+
+
+SOURCES = (
+    "http://127.0.0.1:8080/stream.mjpg",
+    "http://[::1]:8080/stream?topic=/front&quality=80",
+    "http://camera.local",
+    "v4l2:/dev/video0",
+    "v4l2:/dev/v4l/by-id/usb-Maker_Camera-video-index0",
+    "gstreamer:nvarguscamerasrc ! nvvidconv ! video/x-raw, format=BGRx ! videoconvert ! appsink drop=true",
+    "ros2:/front/image/compressed",
+    "ros2raw:/image",
+)
+
+
+@pytest.mark.parametrize("source", ["robot", *SOURCES])
+def test_a_camera_source_of_a_known_form_is_accepted(source: str) -> None:
+    assert CameraConfig(10.0, 50.0, 500, source).source == source
+
+
+@pytest.mark.parametrize(
+    ("source", "expected"),
+    [
+        ("rtsp://camera/1", "expected robot, http://HOST:PORT/PATH"),
+        ("", "expected robot, http://HOST:PORT/PATH"),
+        ("robot:1", "expected robot, http://HOST:PORT/PATH"),
+        ("http://", "expected http://HOST:PORT/PATH"),
+        ("http://host:0/", "expected http://HOST:PORT/PATH"),
+        ("http://host:65536/", "expected http://HOST:PORT/PATH"),
+        ("http://user:secret@host/", "expected http://HOST:PORT/PATH"),
+        ("http://host/a b", "expected http://HOST:PORT/PATH"),
+        ("http://host/a\r\nX: 1", "expected http://HOST:PORT/PATH"),
+        ("http://host/#part", "expected http://HOST:PORT/PATH"),
+        ("v4l2:0", "expected v4l2:/dev/videoN"),
+        ("v4l2:/dev/video0 ", "expected v4l2:/dev/videoN"),
+        ("v4l2:/dev/../etc/passwd", "expected v4l2:/dev/videoN"),
+        ("gstreamer:v4l2src ! fakesink", "expected gstreamer:PIPELINE that ends in an appsink"),
+        ("gstreamer:appsink", "expected gstreamer:PIPELINE that ends in an appsink"),
+        ("ros2:image", "expected ros2:/TOPIC"),
+        ("ros2:/image/", "expected ros2:/TOPIC"),
+        ("ros2raw:/1image", "expected ros2raw:/TOPIC"),
+    ],
+)
+def test_another_camera_source_is_refused_with_the_form_that_was_expected(source: str, expected: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(f"camera.source: {expected}")) as raised:
+        CameraConfig(10.0, 50.0, 500, source)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("protocol", "source", "complaint"),
+    [
+        ("unitree", "robot", ""),
+        ("unitree", "v4l2:/dev/video0", ""),
+        ("unitree", "ros2:/image", "camera.source: ros2 needs protocol ros2, found protocol unitree"),
+        ("can", "robot", "camera.source: protocol can carries no pictures; expected http://"),
+        ("mavlink", "http://127.0.0.1:8080/s", ""),
+        ("mavlink", "ros2raw:/image", "camera.source: ros2raw needs protocol ros2, found protocol mavlink"),
+        ("ros2", "robot", "camera.source: protocol ros2 carries no pictures; expected http://"),
+        ("ros2", "ros2:/image", ""),
+    ],
+)
+def test_a_protocol_permits_the_sources_that_it_can_have(protocol: str, source: str, complaint: str) -> None:
+    camera = CameraConfig(10.0, 50.0, 500, source)
+    if complaint:
+        with pytest.raises(ConfigError, match=re.escape(complaint)):
+            camera.check_protocol(protocol)
+    else:
+        camera.check_protocol(protocol)

@@ -133,3 +133,16 @@ def test_failures_are_counted_and_the_next_frame_is_requested() -> None:
     assert poller.failures == 2
     assert poller.frames >= 1
     assert poller.last_error == "camera: no answer"
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_capture_stamp_of_the_source_replaces_the_estimate(known: bool) -> None:
+    stamp_ns = time.monotonic_ns() - 500 * MS
+    poller = CameraPoller(
+        lambda _timeout_s: jpeg(), image_px=64, period_ns=20 * MS, timeout_s=0.2, latency_ns=0,
+        captured_ns=lambda: stamp_ns if known else None,
+    )  # fmt: skip
+    poller.start()
+    time.sleep(0.1)
+    poller.close()
+    assert poller.newest is not None and (poller.newest.stamp_ns == stamp_ns) is known
