@@ -46,7 +46,9 @@ class Ros2Config(Section):
         legal = len(self.namespace) <= MAX_NAME_CHARS and _NAMESPACE.fullmatch(self.namespace)
         require(bool(legal), f'ros2.namespace: expected "/" or a name such as "/robot1", found {self.namespace!r}')
         frame_ok = len(self.command_frame) <= MAX_NAME_CHARS and _NAME.fullmatch(self.command_frame)
-        require(bool(frame_ok), f'ros2.command_frame: expected a frame such as "base_link", found {self.command_frame!r}')
+        require(
+            bool(frame_ok), f'ros2.command_frame: expected a frame such as "base_link", found {self.command_frame!r}'
+        )
         used: dict[str, str] = {}
         for key in ("odometry", "command", "imu", "battery", "instruction"):
             name: str = getattr(self, key)
@@ -57,9 +59,9 @@ class Ros2Config(Section):
         stops = 0 < self.base_timeout_ms <= LONGEST_BASE_TIMEOUT_MS
         require(
             stops or self.supervised,
-            f"ros2.base_timeout_ms: expected 1..{LONGEST_BASE_TIMEOUT_MS}, found {self.base_timeout_ms}: the base drives"
-            " on when the bridge dies; give the base a command timeout, or write ros2.supervised = true and keep a"
-            " person at the base's own emergency stop",
+            f"ros2.base_timeout_ms: expected 1..{LONGEST_BASE_TIMEOUT_MS}, found {self.base_timeout_ms}: the base"
+            " drives on when the bridge dies; give the base a command timeout, or write ros2.supervised = true and keep"
+            " a person at the base's own emergency stop",
         )
 
     def topic(self, name: str) -> str:

@@ -152,9 +152,7 @@ class RobotLink:
                 f"no node subscribes to {self._command_topic} as {kind}; start the base's driver, or correct"
                 " ros2.command and ros2.stamped in the robot file"
             )
-        if self._imu is not None and (
-            self._attitude is None or now_ns - self._attitude.received_ns > _IMU_SILENT_NS
-        ):
+        if self._imu is not None and (self._attitude is None or now_ns - self._attitude.received_ns > _IMU_SILENT_NS):
             return f"no usable message on {self._settings.topic(self._settings.imu)} for {_IMU_SILENT_NS / 1e6:.0f} ms"
         return None
 

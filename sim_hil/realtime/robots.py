@@ -119,7 +119,7 @@ ROBOTS: Mapping[str, StackRobot] = MappingProxyType(
                 "can",
                 "carter_can_sim.toml",
                 ("--link=serial:{folder}/can,camera={camera_port}",),
-                (("can.interface", "serial"), ("can.channel", "{folder}/can"), _CAMERA),
+                (("can.channel", "{folder}/can"), ("can.dbc", str(ROBOT_FILES / "carter.dbc")), _CAMERA),
             ),
             StackRobot(
                 "carter-mavlink",
@@ -135,7 +135,7 @@ ROBOTS: Mapping[str, StackRobot] = MappingProxyType(
                 "ros2",
                 "carter_ros2_sim.toml",
                 ("--interface", "lo", "--domain={domain}"),
-                (_DOMAIN, ("camera.source", "ros2:/camera/image/compressed")),
+                (_DOMAIN,),
             ),
         )
     }

@@ -61,9 +61,7 @@ def odometry(sensors: Sensors, stamp_s: float) -> Odometry_:
     speed = Twist_(Vector3_(sensors.v_mps, 0.0, 0.0), Vector3_(0.0, 0.0, sensors.w_radps))
     covariance = _diagonal(6, _POSE_VARIANCE)
     stamped = header(stamp_s, ODOM_FRAME)
-    return Odometry_(
-        stamped, BASE_FRAME, PoseWithCovariance_(at, covariance), TwistWithCovariance_(speed, covariance)
-    )
+    return Odometry_(stamped, BASE_FRAME, PoseWithCovariance_(at, covariance), TwistWithCovariance_(speed, covariance))
 
 
 def imu(sensors: Sensors, truth: CarterTruth, stamp_s: float) -> Imu_:

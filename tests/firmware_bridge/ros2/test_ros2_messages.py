@@ -153,9 +153,7 @@ def announced(bus: Bus, builtin: Any, make: Callable[[], object], topic: str) ->
 
 def test_a_command_is_announced_as_rclpy_announces_it(bus: Bus) -> None:
     """rclpy's default profile: reliable, volatile, no deadline, automatic liveliness."""
-    end = announced(
-        bus, BuiltinTopicDcpsPublication, lambda: bus.writer("rt/cmd_vel", common.Twist_), "rt/cmd_vel"
-    )
+    end = announced(bus, BuiltinTopicDcpsPublication, lambda: bus.writer("rt/cmd_vel", common.Twist_), "rt/cmd_vel")
     assert end.type_name == "geometry_msgs::msg::dds_::Twist_"
     assert isinstance(end.qos[Policy.Reliability], Policy.Reliability.Reliable)
     assert end.qos[Policy.Durability] == Policy.Durability.Volatile
@@ -164,9 +162,7 @@ def test_a_command_is_announced_as_rclpy_announces_it(bus: Bus) -> None:
 
 def test_a_sensor_reader_is_announced_as_rclpys_sensor_profile(bus: Bus) -> None:
     """Best effort and volatile: matches reliable and best-effort publishers."""
-    end = announced(
-        bus, BuiltinTopicDcpsSubscription, lambda: bus.reader("rt/odom", navigation.Odometry_), "rt/odom"
-    )
+    end = announced(bus, BuiltinTopicDcpsSubscription, lambda: bus.reader("rt/odom", navigation.Odometry_), "rt/odom")
     assert end.type_name == "nav_msgs::msg::dds_::Odometry_"
     assert end.qos[Policy.Reliability] == Policy.Reliability.BestEffort
     assert end.qos[Policy.Durability] == Policy.Durability.Volatile
