@@ -10,10 +10,16 @@ from typing import Final
 from firmware_bridge.core.config import RobotConfig
 from firmware_bridge.core.robot_state import BatteryState, CameraError, RobotState, StampOrder
 from firmware_bridge.dds.bus import Bus, take_each
+from firmware_bridge.dds.publishers import PublisherWatch
 from firmware_bridge.unitree.messages.idl import SportModeState_
 from firmware_bridge.unitree.messages.idl_low import LowState_
-from firmware_bridge.unitree.messages.ids import GET_IMAGE_SAMPLE, LF_LOW_STATE_TOPIC, SPORT_STATE_TOPIC, VIDEO_SERVICE
-from firmware_bridge.unitree.publishers import PublisherWatch
+from firmware_bridge.unitree.messages.ids import (
+    GET_IMAGE_SAMPLE,
+    LF_LOW_STATE_TOPIC,
+    SPORT_STATE_TOPIC,
+    VIDEO_SERVICE,
+    trusted_publishers,
+)
 from firmware_bridge.unitree.report import battery_state, robot_state
 from firmware_bridge.unitree.rpc import RpcClient, RpcError
 
@@ -73,7 +79,7 @@ class Go2Reader:
 
     def surplus_publishers(self) -> str | None:
         """Which topic of the robot has more publishers than it should have; None while discovery knows of none."""
-        self._publishers = self._publishers or PublisherWatch(self._bus, self._motor_publishers)
+        self._publishers = self._publishers or PublisherWatch(self._bus, trusted_publishers(self._motor_publishers))
         return self._publishers.surplus()
 
     def set_state_listener(self, listener: Callable[[RobotState], None] | None) -> None:

@@ -12,10 +12,10 @@ from firmware_bridge.core.config import RobotConfig
 from firmware_bridge.core.robot_state import BatteryState, RobotState, StampOrder, within
 from firmware_bridge.core.step_types import Identify, Move, Report, Request, Stand
 from firmware_bridge.dds.bus import Bus, take_each
+from firmware_bridge.dds.publishers import PublisherWatch
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.messages.idl import Request_, SportModeState_, WirelessController_
 from firmware_bridge.unitree.messages.idl_low import LowState_
-from firmware_bridge.unitree.publishers import PublisherWatch
 from firmware_bridge.unitree.remote import StopKeys
 from firmware_bridge.unitree.report import battery_state, robot_state
 from firmware_bridge.unitree.requests import Requester, move_parameter
@@ -48,7 +48,7 @@ class RobotLink:
             (service, harmless, bus.reader(ids.request_topic(service), Request_, depth=8, foreign=True))
             for service, harmless in ids.COMMANDING_SERVICES.items()
         ]
-        self._publishers = PublisherWatch(bus, config.safety.robot_lowcmd_publishers)
+        self._publishers = PublisherWatch(bus, ids.trusted_publishers(config.safety.robot_lowcmd_publishers))
         self._order = StampOrder()
         self._battery_due_ns = 0
         self._sent: dict[int, int] = {}  # request id -> api id of unanswered requests

@@ -48,11 +48,13 @@ class Running:
 
 
 @contextlib.contextmanager
-def running(module: str, *arguments: object, folder: Path, ready: str = "ready") -> Iterator[Running]:
+def running(
+    module: str, *arguments: object, folder: Path, ready: str = "ready", python: str = sys.executable
+) -> Iterator[Running]:
     """`python -m module arguments...`, from the moment its stderr contains `ready` to the end of the block."""
     stderr = folder / f"{module}.stderr"
     with stderr.open("wb") as file:
-        command = [sys.executable, "-m", module, *map(str, arguments)]
+        command = [python, "-m", module, *map(str, arguments)]
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=file, cwd=REPOSITORY)
     started = Running(process, stderr)
     try:

@@ -1,4 +1,4 @@
-"""Prove on an emulated arm64 computer what docs/robot.md has a user do: install, check, replay and drive.
+"""Prove on an emulated arm64 computer what docs/robot.md has a user do: install, check, replay, drive and update.
 
 Needs root, debootstrap and qemu-user-static. The root folder (1 GB) is made once and kept. Emulation is 20 to 50 times
 slower than a board: its times say nothing about one. Writes DIR/result.json and DIR/transcript.txt.
@@ -10,23 +10,24 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, command_line, messages, write_result
 from tools.board import drive as board_drive
-from tools.board.root import RootError, inside, make_root, mounted, run
+from tools.board import journey
+from tools.board.journey import HOME, INPUT, INSTALLER, ROBOT_FILE
+from tools.board.root import RootError, ended, make_root, mounted, run
 
-HOME: Final = "opt/tic-vla-edge"
-BIN: Final = f"/{HOME}/venv/bin"
 REPOSITORY: Final = Path(__file__).resolve().parents[2]
 ROBOT: Final = REPOSITORY / "firmware_bridge/robots/go2_sim.toml"
-QUIET: Final = ("cpuinfo", "cpuid_info")  # ONNX Runtime about the emulated processor
+LINES: Final = 40  # of a step's output in the result
 
 
 @command_line("board", {RootError: EXIT_BAD_INPUT})
@@ -39,9 +40,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             messages("board")(f"{path}: no such file")
             return EXIT_BAD_INPUT
     make_root(args.root)
-    _copy(args)
+    (args.out / "transcript.txt").unlink(missing_ok=True)
+    wheels = _copy(args)
     with mounted(args.root):
-        results = list(_steps(args))
+        results = list(_steps(args, *wheels))
     write_result(str(args.out / "result.json"), {"tagged": "measured, emulated", "steps": results})
     return EXIT_DONE if all(step["passed"] for step in results) else EXIT_CHECK_FAILED
 
@@ -50,7 +52,13 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "python -m tools.board", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--root", type=Path, required=True, metavar="DIR", help="folder of the arm64 root, made once")
+    parser.add_argument(
+        "--root",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="folder of the arm64 root, made once; /opt in it is ours",
+    )
     parser.add_argument(
         "--artifacts", type=Path, required=True, metavar="DIR", help="artifacts exported on this machine"
     )
@@ -61,54 +69,67 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _copy(args: argparse.Namespace) -> None:
-    """Put the wheel of this checkout, the artifacts, the log and the robot file into the root."""
-    home = args.root / HOME
-    shutil.rmtree(home / "input", ignore_errors=True)
-    shutil.copytree(args.artifacts, home / "input/artifacts")
-    shutil.copy(args.flight, home / "input/flight.mcap")
-    shutil.copy(REPOSITORY / "constraints.txt", home / "input/constraints.txt")
-    shutil.copy(ROBOT, home / "robot.toml")
-    run([sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(home / "input"), str(REPOSITORY)])
+def _copy(args: argparse.Namespace) -> tuple[str, str]:
+    """Put what a user copies to a board into the root; returns the names of two wheels of this checkout.
+
+    They differ in their build tag only, which is enough for another release.
+    """
+    folder = args.root / INPUT.lstrip("/")
+    for old in (folder, args.root / HOME.lstrip("/"), args.root / INSTALLER.lstrip("/")):
+        shutil.rmtree(old, ignore_errors=True)
+    shutil.copytree(args.artifacts, folder / "artifacts")
+    shutil.copy(args.flight, folder / "flight.mcap")
+    shutil.copy(REPOSITORY / "constraints.txt", folder / "constraints.txt")
+    robot = args.root / ROBOT_FILE.lstrip("/")
+    robot.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copy(ROBOT, robot)
+    run([sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(folder), str(REPOSITORY)])
+    (wheel,) = folder.glob("*.whl")
+    name, version, tags = wheel.name.split("-", 2)
+    next_wheel = f"{name}-{version}-1-{tags}"
+    shutil.copy(wheel, folder / next_wheel)
+    return wheel.name, next_wheel
 
 
-def _steps(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+def _steps(args: argparse.Namespace, wheel: str, next_wheel: str) -> Iterator[dict[str, Any]]:
     """Run one step after another; each gives its name, whether it passed, seconds and what it found."""
-    home, root = f"/{HOME}", args.root
-    wheel = next((root / HOME / "input").glob("*.whl")).name
-    artifacts, flight = f"{home}/input/artifacts", f"{home}/input/flight.mcap"
-    pip = [f"{BIN}/pip", "--disable-pip-version-check", "install", "-q", "-c", f"{home}/input/constraints.txt"]
-    replay = [f"{BIN}/edge-replay", flight, "--artifacts", artifacts, "--to", str(args.replay_to), "--json", "-"]
-    commands: dict[str, list[str]] = {
-        "make the environment": ["python3", "-m", "venv", f"{home}/venv"],
-        "install the wheel": [*pip, "--force-reinstall", f"{home}/input/{wheel}[cpu]"],
-        "edge-install dds": [f"{BIN}/edge-install", "dds"],
-        "edge-install dds, again": [f"{BIN}/edge-install", "dds"],
-        "edge-run --help": [f"{BIN}/edge-run", "--help"],
-        "edge-doctor": [f"{BIN}/edge-doctor", "--artifacts", artifacts, "--ticks", "0"],
-        "edge-export verify": [f"{BIN}/edge-export", "verify", artifacts],
-        "edge-replay": replay,
-        "size": ["du", "-sm", f"{home}/venv"],
-    }
-    for name, words in commands.items():
-        yield _step(args.out, name, lambda words=words: {"output": inside(root, words)})  # type: ignore[misc]
-    yield _step(args.out, "edge-bridge drives", lambda: board_drive.drive(root, args.out, args.domain))
+    for command in (*journey.installation(wheel), *journey.use(args.replay_to)):
+        yield _command(args, command)
+    yield _drive(args)
+    for command in journey.update(next_wheel):
+        yield _command(args, command)
 
 
-def _step(out: Path, name: str, action: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+def _command(args: argparse.Namespace, command: journey.Command) -> dict[str, Any]:
+    done = ended(args.root, command.words)
+    current = journey.current_release(args.root)
+    fault = command.fault(done.code, done.output, current)
+    lines = [line for line in done.output.splitlines() if not any(word in line for word in journey.QUIET)]
+    found: dict[str, Any] = {"command": shlex.join(command.words), "exit_code": done.code, "current": current}
+    found["peak_rss_mb"] = done.peak_rss_mb
+    if "-X" in command.words:
+        (args.out / "importtime.txt").write_text(done.output)
+        found["imports"], lines = journey.import_times(done.output), []
+    return _note(args.out, command.name, fault, done.wall_s, {**found, "output": lines[-LINES:]})
+
+
+def _drive(args: argparse.Namespace) -> dict[str, Any]:
     started_s = time.monotonic()
+    fault, found = None, {}
     try:
-        found, passed = action(), True
-    except (RootError, board_drive.DriveError, subprocess.SubprocessError) as error:
-        found, passed = {"error": str(error)}, False
-    wall_s = round(time.monotonic() - started_s, 1)
-    if "output" in found:
-        lines = [line for line in str(found["output"]).splitlines() if not any(word in line for word in QUIET)]
-        found = {"output": lines[-40:]}
+        found = board_drive.drive(args.root, args.out, args.domain)
+    except (board_drive.DriveError, subprocess.SubprocessError) as error:
+        fault = str(error)
+    return _note(args.out, "edge-bridge drives", fault, round(time.monotonic() - started_s, 1), found)
+
+
+def _note(out: Path, name: str, fault: str | None, wall_s: float, found: dict[str, Any]) -> dict[str, Any]:
+    """Write a step to the transcript and to the terminal, and return it."""
+    result = "passed" if fault is None else f"FAILED: {fault}"
     with (out / "transcript.txt").open("a") as file:
-        file.write(f"== {name}: {'passed' if passed else 'FAILED'}, {wall_s} s\n{json.dumps(found, indent=1)}\n")
-    print(f"board: {name}: {'passed' if passed else 'FAILED'}, {wall_s} s", flush=True)
-    return {"name": name, "passed": passed, "wall_s": wall_s, **found}
+        file.write(f"== {name}: {result}, {wall_s} s\n{json.dumps(found, indent=1)}\n")
+    print(f"board: {name}: {result}, {wall_s} s", flush=True)
+    return {"name": name, "passed": fault is None, "fault": fault, "wall_s": wall_s, **found}
 
 
 if __name__ == "__main__":

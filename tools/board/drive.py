@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from firmware_bridge.client import BridgeClient
+from tools.board.journey import BIN, ROBOT_FILE
 
 SPEED_MPS: Final = 0.4
 DRIVE_S: Final = 6.0
 START_S: Final = 90.0  # an emulated bridge imports for 10 s; the robot stands up in 4 s
 DEADMAN_S: Final = 1.5
 REST_MPS: Final = 0.05
-ROBOT_FILE: Final = "/opt/tic-vla-edge/robot.toml"
 SOCKET: Final = "run/tic-vla-edge-proof/bridge.sock"
 
 
@@ -43,7 +43,7 @@ def drive(root: Path, out: Path, domain: int) -> dict[str, Any]:
         "unitree",
     ]
     hil += ["--domain", str(domain), "--camera", "none", "--trace", str(trace), "--pose-hz", "50"]
-    bridge = ["chroot", str(root), "/opt/tic-vla-edge/venv/bin/edge-bridge", "--robot", ROBOT_FILE]
+    bridge = ["chroot", str(root), f"{BIN}/edge-bridge", "--robot", ROBOT_FILE]
     bridge += ["--domain", str(domain), "--socket", f"/{SOCKET}", "--latch", f"/{SOCKET}.latch"]
     with (out / "robot.log").open("w") as robot_log, (out / "bridge.log").open("w") as bridge_log:
         robot = subprocess.Popen(hil, stdout=robot_log, stderr=robot_log)

@@ -6,7 +6,10 @@ import contextlib
 import os
 import shutil
 import subprocess
+import tempfile
+import time
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -18,6 +21,12 @@ TOOLS: Final = {"debootstrap": "debootstrap", "qemu-aarch64-static": "qemu-user-
 BINFMT: Final = Path("/proc/sys/fs/binfmt_misc")
 HANDLER: Final = Path("/usr/lib/binfmt.d/qemu-aarch64.conf")
 _STAMP: Final = "etc/tic-vla-edge-root"
+_ENVIRONMENT: Final = {
+    "DEBIAN_FRONTEND": "noninteractive",
+    "HOME": "/root",
+    "LC_ALL": "C.UTF-8",
+    "PATH": "/usr/sbin:/usr/bin:/sbin:/bin",
+}
 
 
 class RootError(RuntimeError):
@@ -69,9 +78,10 @@ def make_root(root: Path) -> bool:
 def mounted(root: Path) -> Iterator[None]:
     """Give the root /proc and /dev while the block runs.
 
-    /sys stays empty: ONNX Runtime would read this machine's processors there and crash.
+    /sys stays empty: ONNX Runtime would read this machine's processors there and crash. The copy of /dev is a slave:
+    its unmounting must not unmount this machine's own /dev/pts.
     """
-    mounts = [(["-t", "proc", "proc"], root / "proc"), (["--rbind", "/dev"], root / "dev")]
+    mounts = [(["-t", "proc", "proc"], root / "proc"), (["--rbind", "--make-rslave", "/dev"], root / "dev")]
     try:
         for words, target in mounts:
             if not os.path.ismount(target):
@@ -83,10 +93,35 @@ def mounted(root: Path) -> Iterator[None]:
                 subprocess.run(["umount", "--lazy", "--recursive", str(target)], check=False)
 
 
+@dataclass(frozen=True)
+class Ended:
+    """An ended command of the root."""
+
+    code: int
+    output: str
+    wall_s: float
+    peak_rss_mb: float
+    """Largest memory of one of its processes, the emulator's own included, MB."""
+
+
 def inside(root: Path, words: Sequence[str]) -> str:
     """Run a command in the root and return its output. Raises RootError."""
-    environment = {"DEBIAN_FRONTEND": "noninteractive", "PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "LC_ALL": "C.UTF-8"}
-    return run(["chroot", str(root), *words], environment)
+    return run(["chroot", str(root), *words], _ENVIRONMENT)
+
+
+def ended(root: Path, words: Sequence[str]) -> Ended:
+    """Run a command in the root, whatever its exit code."""
+    started_s = time.monotonic()
+    with tempfile.TemporaryFile() as file:
+        process = subprocess.Popen(
+            ["chroot", str(root), *words], env=_ENVIRONMENT, stdin=subprocess.DEVNULL, stdout=file, stderr=file
+        )
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = code = os.waitstatus_to_exitcode(status)
+        wall_s = round(time.monotonic() - started_s, 1)
+        file.seek(0)
+        output = file.read().decode(errors="replace")
+    return Ended(code, output, wall_s, round(usage.ru_maxrss / 1024, 1))
 
 
 def run(words: Sequence[str], environment: dict[str, str] | None = None) -> str:

@@ -77,3 +77,9 @@ def request_topic(service: str) -> str:
 def response_topic(service: str) -> str:
     """DDS topic on which `service` answers."""
     return f"rt/api/{service}/response"
+
+
+def trusted_publishers(own_motor_publishers: int) -> dict[str, int]:
+    """Return how many publishers each trusted topic may have; of motor commands, the robot's own."""
+    inputs = (SPORT_STATE_TOPIC, LF_LOW_STATE_TOPIC, REMOTE_TOPIC, response_topic(SPORT_SERVICE))
+    return {**dict.fromkeys(inputs, 1), LOW_COMMAND_TOPIC: own_motor_publishers}

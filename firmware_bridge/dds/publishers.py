@@ -1,7 +1,7 @@
-"""Counts by DDS discovery the publishers of the topics that the bridge trusts.
+"""Counts by DDS discovery the publishers of the topics that the bridge trusts or commands.
 
-DDS of the robot is not authenticated: a second publisher of an input topic is another robot or a forger, and a
-publisher of motor commands bypasses the sport service. Discovery shows both before their first sample.
+A robot's DDS is not authenticated: a second publisher of an input topic is another robot or a forger, and another
+publisher of commands is a second commander. Discovery shows both before their first sample.
 """
 
 from __future__ import annotations
@@ -13,26 +13,18 @@ from typing import Any, Final
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 
 from firmware_bridge.dds.bus import DDS_ERRORS, DECODE_ERRORS, Bus
-from firmware_bridge.unitree.messages import ids
 
 _FEW: Final = 16  # announcements a step
 _MOST: Final = 64  # publishers kept; a flood of more must not cost memory or time
-INPUT_TOPICS: Final = (
-    *(ids.SPORT_STATE_TOPIC, ids.LF_LOW_STATE_TOPIC, ids.REMOTE_TOPIC),
-    ids.response_topic(ids.SPORT_SERVICE),
-)
 
 
 class PublisherWatch:
-    """Counts other processes' publishers of `INPUT_TOPICS` and of the motor commands."""
+    """Counts other processes' publishers of some topics."""
 
-    def __init__(self, bus: Bus, own_motor_publishers: int) -> None:
-        """`own_motor_publishers`: number of the robot's own publishers of motor commands."""
+    def __init__(self, bus: Bus, allowed: Mapping[str, int]) -> None:
+        """`allowed`: largest number of publishers of each watched DDS topic."""
         self._own = str(bus.participant.guid)
-        self._allowed: Mapping[str, int] = {
-            **dict.fromkeys(INPUT_TOPICS, 1),
-            ids.LOW_COMMAND_TOPIC: own_motor_publishers,
-        }
+        self._allowed = dict(allowed)
         self._topics: dict[str, str] = {}  # GUID of a publisher -> topic
         self._flooded = False
         self._reader: Any = BuiltinDataReader(bus.participant, BuiltinTopicDcpsPublication)

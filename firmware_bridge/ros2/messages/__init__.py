@@ -1,0 +1,1 @@
+"""ROS 2 messages as DDS types, without a ROS installation."""

@@ -1,0 +1,81 @@
+"""The table [ros2] of a robot file: topic names, and what a base without a command timeout needs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from firmware_bridge.core.config import ConfigError, load_robot_config
+from firmware_bridge.core.config_ros2 import Ros2Config, dds_topic
+from tests.support.processes import GO2_SIM
+
+CARTER_ROS2 = GO2_SIM.with_name("carter_ros2_sim.toml")
+
+
+@pytest.mark.parametrize("name", ["carter_ros2_sim.toml", "ros2_base.toml"])
+def test_the_shipped_files_are_valid(name: str) -> None:
+    config = load_robot_config(GO2_SIM.with_name(name))
+    assert config.protocol == "ros2" and config.ros2 is not None
+
+
+@pytest.mark.parametrize(
+    ("namespace", "name", "topic"),
+    [
+        ("/", "cmd_vel", "rt/cmd_vel"),
+        ("/robot1", "cmd_vel", "rt/robot1/cmd_vel"),
+        ("/robot1", "/cmd_vel", "rt/cmd_vel"),
+        ("/a/b", "c/d_e", "rt/a/b/c/d_e"),
+    ],
+)
+def test_a_topic_is_relative_to_the_namespace_or_full(namespace: str, name: str, topic: str) -> None:
+    assert dds_topic(name, namespace) == topic
+    assert Ros2Config(500, namespace=namespace, command=name).topic(name) == topic
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["a//b", "a/", "1a", "a/2b", "a-b", "a b", "~/a", "{node}/a", "a__b", "/", "ä", "a\n", "a" * 201, "a\0", "/a/"],
+)
+def test_an_illegal_topic_name_is_refused(name: str) -> None:
+    with pytest.raises(ConfigError, match=r"ros2\.odometry: expected a ROS 2 topic name"):
+        Ros2Config(500, odometry=name)
+
+
+@pytest.mark.parametrize("namespace", ["robot1", "/robot1/", "", "//", "/a__b", "/1"])
+def test_an_illegal_namespace_is_refused(namespace: str) -> None:
+    with pytest.raises(ConfigError, match=r"ros2\.namespace"):
+        Ros2Config(500, namespace=namespace)
+
+
+def test_two_keys_with_one_topic_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"ros2\.command: expected a topic of its own, found that of ros2\.odometry"):
+        Ros2Config(500, odometry="/cmd_vel")
+
+
+@pytest.mark.parametrize("timeout_ms", [0, 2001])
+def test_a_base_that_does_not_stop_by_itself_needs_supervision(timeout_ms: int) -> None:
+    with pytest.raises(ConfigError, match=r"ros2\.base_timeout_ms: .*supervised = true"):
+        Ros2Config(timeout_ms)
+    assert Ros2Config(timeout_ms, supervised=True).supervised
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "complaint"),
+    [
+        ("base_timeout_ms = 500", "", "missing key ros2.base_timeout_ms"),
+        ("base_timeout_ms = 500", "base_timeout_ms = -1", "ros2.base_timeout_ms: expected 0..60000, found -1"),
+        ('command = "cmd_vel"', 'cmd = "cmd_vel"', "unknown key ros2.cmd"),
+        ('imu = "imu"', 'imu = ""', "ros2.imu: expected str"),
+        ('battery = "battery_state"', "", "missing key ros2.battery"),
+        ("battery_min_percent = 10", 'sport_version = "1"', "safety.sport_version: only protocol unitree"),
+        ("vy_max_mps = 0.0", "vy_max_mps = 0.6", "limits.vy_max_mps: expected 0.5 at most"),
+    ],
+)
+def test_a_wrong_file_is_refused_in_one_line(tmp_path: Path, before: str, after: str, complaint: str) -> None:
+    text, path = CARTER_ROS2.read_text(), tmp_path / "robot.toml"
+    assert before in text
+    path.write_text(text.replace(before, after))
+    with pytest.raises(ConfigError) as error:
+        load_robot_config(path)
+    assert complaint in str(error.value) and "\n" not in str(error.value)
