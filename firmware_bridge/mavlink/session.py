@@ -48,6 +48,8 @@ _AGAIN_NS: Final = 2_000_000_000
 _CLASH_NS: Final = 2_000_000_000
 _REASON_WAIT_NS: Final = 200_000_000  # an autopilot's text may follow its acknowledgement
 _OWN_NS: Final = 3_000_000_000
+_MAX_DENIALS: Final = 4
+_HELD: Final = "in control"
 _MAX_A_STEP: Final = 256  # messages; more in one step are left unread
 _VEHICLE: Final = (0, _SYS_STATUS, 22, _ATTITUDE, _POSITION, 77, 111, _BATTERY, _EKF, _ESTIMATOR, 253, _ODOMETRY)
 _OTHERS: Final = (*stations.MOTION_MESSAGES, stations.COMMAND_INT, stations.COMMAND_LONG)
@@ -95,7 +97,7 @@ class Session:
         self._intervals_ns = 0
         self._stream_until_ns = self._stream_since_ns = self._setpoint_ns = -_AGAIN_NS
         self._own_ns: dict[int, int] = {}  # command -> when the bridge has last sent it
-        self._denials: list[tuple[int, str]] = []
+        self._denials: list[tuple[int, str, str]] = []  # when, command, result
         self._told: set[str] = set()
 
     # Received messages
@@ -155,7 +157,7 @@ class Session:
             self._intervals.pop(0)  # one that the autopilot does not know is left out
         elif failed is not None:
             name = stations.MOTION_COMMANDS.get(command, f"command {command}")
-            self._denials.append((now_ns, f"the rover answered {name}: {failed}"))
+            self._denials.append((now_ns, name, failed))
 
     def _timesync(self, message: Message, now_ns: int) -> None:
         if message.tc1 == 0:  # the autopilot asks for our time
@@ -174,7 +176,7 @@ class Session:
         """Return the report of everything taken since the last call, and queue the packets that are due."""
         self._now_ns, self._taken = now_ns, 0
         self._periodic(now_ns)
-        self._explain(now_ns)
+        denied = self._explain(now_ns)
         foreign, self._foreign = self._foreign, None
         lost = self.watch.is_lost(now_ns)
         state = self.odometry.state(self.watch, lost=lost)
@@ -189,6 +191,7 @@ class Session:
             remote_in_use=switched or self.watch.in_use(),
             remote_estop=self.watch.is_emergency(),
             foreign=foreign,
+            denied=denied,
             publishers=f"another sender uses our number {self._config.station}/{COMPONENT}" if clash else None,
             battery=self.odometry.take_battery(),
             version=self._version(),
@@ -239,16 +242,23 @@ class Session:
         self._intervals = list(_RATES_HZ[self._autopilot.name])
         self._intervals_ns = self._now_ns
 
-    def _explain(self, now_ns: int) -> None:
-        """Tell the operator why a command was denied, in the autopilot's own words if they come in time."""
-        waiting: list[tuple[int, str]] = []
-        for denied_ns, line in self._denials:
+    def _explain(self, now_ns: int) -> str | None:
+        """Tell the operator why a command was denied, in the autopilot's own words if they come in time.
+
+        Return the name of a command that was denied because another station is in control: only the text says so.
+        """
+        held: str | None = None
+        waiting: list[tuple[int, str, str]] = []
+        for denied_ns, name, result in self._denials:
             reason = self._texts.reason(denied_ns)
-            if reason is not None or now_ns - denied_ns >= _REASON_WAIT_NS:
-                self._tell(f"{line} ({reason})" if reason else f"{line}, without a reason")
-            else:
-                waiting.append((denied_ns, line))
-        self._denials = waiting[-4:]
+            if reason is None and now_ns - denied_ns < _REASON_WAIT_NS:
+                waiting.append((denied_ns, name, result))
+                continue
+            why = "without a reason" if reason is None else f"reason: {reason}"
+            self._tell(f"the rover answered {name}: {result}, {why}")
+            held = name if reason is not None and _HELD in reason.lower() else held
+        self._denials = waiting[-_MAX_DENIALS:]
+        return held
 
     def _tell_once(self, line: str) -> None:
         if line not in self._told:
