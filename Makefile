@@ -7,6 +7,7 @@ install = $(BIN)/python -m pip --disable-pip-version-check install -c constraint
 SEED ?= 0
 PEOPLE ?= 4
 DURATION ?= 60
+ROBOT ?= go2
 
 # Tests: two at a time with one thread each where they are isolated, one at a time where they start real-time processes.
 WORKERS ?= 2
@@ -26,6 +27,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 help:
 	@echo "make demo   export, simulate, drive for $(DURATION) s and write out/demo/report.html"
+	@echo "            ROBOT=carter-can, carter-mavlink or carter-ros2: another robot and protocol than the go2's"
 	@echo "make demos  the demo with ten seeds (about 15 min); out/demos/SEED/report.html"
 	@echo "make nano   train the shipped model from nothing into out/nano-run (hours; Ctrl-C and again goes on)"
 	@echo "make faults inject every fault into real processes, some 230 times (about 15 min), and write out/faults/"
@@ -52,13 +54,13 @@ help:
 	@touch $@
 
 demo: .venv/.demo-installed
-	@$(BIN)/python -m tools.demo --out out/demo --duration $(DURATION) --seed $(SEED) --people $(PEOPLE)
+	@$(BIN)/python -m tools.demo --robot $(ROBOT) --out out/demo --duration $(DURATION) --seed $(SEED) --people $(PEOPLE)
 
 # Ten worlds with one model, each with a report of its own; says how many passed every check.
 demos: .venv/.demo-installed
 	@$(BIN)/edge-export --target cpu --model nano --out out/demos/artifacts
 	@passed=0; for seed in 0 1 2 3 4 5 6 7 8 9; do \
-		$(BIN)/python -m tools.demo --out out/demos/$$seed --artifacts out/demos/artifacts --duration $(DURATION) --seed $$seed --people $(PEOPLE); \
+		$(BIN)/python -m tools.demo --robot $(ROBOT) --out out/demos/$$seed --artifacts out/demos/artifacts --duration $(DURATION) --seed $$seed --people $(PEOPLE); \
 		code=$$?; case $$code in 0) passed=$$((passed + 1));; 1) ;; *) exit $$code;; esac; \
 	done; echo "make: $$passed of 10 seeds passed, 9 are asked for"; test $$passed -ge 9
 
@@ -70,7 +72,7 @@ nano: .venv/.demo-installed
 # The demo's artifacts, if they are there; otherwise its own.
 faults: .venv/.demo-installed
 	@test -f out/demo/artifacts/manifest.json || $(BIN)/edge-export --target cpu --model nano --random-weights 0 --out out/demo/artifacts
-	@$(BIN)/python -m tools.faults --artifacts out/demo/artifacts --out out/faults
+	@$(BIN)/python -m tools.faults --robot $(ROBOT) --artifacts out/demo/artifacts --out out/faults
 
 lint: .venv/.test-installed
 	$(BIN)/ruff check .

@@ -1,4 +1,4 @@
-"""The demo: export the graphs, start a simulated Go2 and the bridge, drive for a minute, write a report.
+"""The demo: export the graphs, start a simulated robot and the bridge, drive for a minute, write a report.
 
 It starts the commands that a user would type, in this order, and reads their result files:
 edge-export → edge-hil → edge-bridge → edge-run → report.
@@ -30,9 +30,11 @@ from edge.core.cli import (
 from export.checkpoint.load import shipped_weights
 from export.model.config import PRESETS
 from export.model.weights import CheckpointError
+from firmware_bridge.core.config import ConfigError, load_robot_config
 from reporting.progress import Progress
 from sim_hil.realtime.children import Child, Children, StepError
-from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_FILE, free_domain, slow_robot, socket_dir
+from sim_hil.realtime.robots import BRIDGE_SOCKET, GO2, ROBOTS, RunAddress, StackRobot, StackRobotError, free_domain
+from sim_hil.realtime.stack import COMMANDS, READY_LINE, socket_dir
 from sim_hil.realtime.truth import LineTail
 from tools.report.demo_report import RunFiles, write_report
 from tools.report.machine import machine_facts
@@ -58,6 +60,7 @@ _print = messages("demo")
 EXAMPLES = """examples:
   python -m tools.demo --out out/demo
   python -m tools.demo --out out/crowd --duration 120 --seed 3 --people 8
+  python -m tools.demo --out out/can --robot carter-can
 
 exit codes: 0 done, 1 a step or an acceptance check failed, 2 bad arguments, 130 interrupted
 """
@@ -73,6 +76,7 @@ class DemoOptions:
     seed: int
     people: int
     domain: int
+    robot: StackRobot = GO2
 
     def __post_init__(self) -> None:
         if not 5.0 <= self.duration_s <= 86_400.0:
@@ -89,6 +93,9 @@ class DemoOptions:
             "seed": self.seed,
             "people": self.people,
             "domain": self.domain,
+            "robot": self.robot.name,
+            "protocol": self.robot.protocol,
+            "bridge_growth": _bridge_growth(self.robot.file),
             "artifacts": self._artifacts_from_out(),
         }
 
@@ -108,8 +115,15 @@ class DemoOptions:
         return RunFiles(self.out, self.artifacts)
 
 
+def _bridge_growth(robot_file: Path) -> list[float]:
+    """Return by how much the bridge lets a command grow in one of its periods: m/s, m/s, rad/s."""
+    config = load_robot_config(robot_file)
+    speed, turn = (value / config.bridge.rate_hz for value in (config.limits.accel_mps2, config.limits.alpha_radps2))
+    return [speed, speed, turn]
+
+
 class TraceTail(LineTail):
-    """Follows edge-hil's trace while it is written: Move requests received and metres walked so far."""
+    """Follows edge-hil's trace while it is written: motion requests received and metres driven so far."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -121,7 +135,7 @@ class TraceTail(LineTail):
     def update(self) -> None:
         """Count the records since the last call."""
         for line in self.lines():
-            if line["kind"] == "wire" and line["name"] == "Move":
+            if line["kind"] == "wire" and line["velocity"] is not None:
                 self.moves += 1
             elif line["kind"] == "pose" and line["t_ns"] - self._last_ns >= 1_000_000_000:
                 # One-second steps, so that swaying in place does not count as walking.
@@ -147,7 +161,7 @@ def run_demo(
     # The socket's folder is removed last: until then a child may still write to it.
     with socket_dir() as socket_folder, Children(options.log_dir) as children:
         _export(options, commands["edge-export"], children)
-        _drive(options, commands, children, socket_folder / "bridge.sock")
+        _drive(options, commands, children, RunAddress.free(socket_folder, options.domain))
     _print("writing the report")
     return report(options.files, wall_s=(time.monotonic_ns() - started_ns) / 1e9)
 
@@ -196,12 +210,14 @@ def _run_to_end(children: Children, child: Child, what: str) -> int:
     return code
 
 
-def _drive(options: DemoOptions, commands: Mapping[str, Sequence[str]], children: Children, socket: Path) -> None:
+def _drive(
+    options: DemoOptions, commands: Mapping[str, Sequence[str]], children: Children, address: RunAddress
+) -> None:
     """Start robot, bridge and runner; stop them in the order in which each can write its result."""
-    files, domain = options.files, ["--domain", str(options.domain)]
-    robot = ROBOT_FILE if trained(options.artifacts) else slow_robot(options.out, UNTRAINED_SPEED_MPS)
-    common = ["--robot", str(robot), "--socket", str(socket), *domain]
-    hil = children.start("edge-hil", [*commands["edge-hil"], *_hil_arguments(options), *domain])
+    files, socket = options.files, address.folder / BRIDGE_SOCKET
+    limit_mps = None if trained(options.artifacts) else UNTRAINED_SPEED_MPS
+    common = ["--robot", str(options.robot.write_file(files.robot, address, limit_mps))]
+    hil = children.start("edge-hil", [*commands["edge-hil"], *_hil_arguments(options, address)])
     with _progress(lambda elapsed_s: f"starting the simulated robot, {elapsed_s:.0f} s") as progress:
         children.wait_until(hil, lambda: _says_ready(hil.log), READY_TIMEOUT_S, "ready line", progress.tick)
     bridge_result = ["--json", str(files.result("edge-bridge"))]
@@ -215,7 +231,7 @@ def _drive(options: DemoOptions, commands: Mapping[str, Sequence[str]], children
         trace.update()
         return (
             f"driving {elapsed_s:.0f} s of {options.duration_s:.0f} s and start-up · "
-            f"{trace.moves} commands · {trace.walked_m:.1f} m walked"
+            f"{trace.moves} commands · {trace.walked_m:.1f} m driven"
         )
 
     with _progress(describe) as progress:
@@ -238,12 +254,13 @@ def _stop(children: Children, child: Child) -> None:
         raise child.failure(f"exit code {code} when stopped")
 
 
-def _hil_arguments(options: DemoOptions) -> list[str]:
+def _hil_arguments(options: DemoOptions, address: RunAddress) -> list[str]:
     files = options.files
     # A backstop only: the demo stops the robot itself.
     longest_s = options.duration_s + READY_TIMEOUT_S + BRIDGE_TIMEOUT_S + STARTUP_TIMEOUT_S
     return [
-        *("--robot", "go2", "--scene", "corridor", "--protocol", "unitree", "--interface", "lo"),
+        *options.robot.hil_arguments(address),
+        *("--scene", "corridor"),
         *("--people", str(options.people), "--seed", str(options.seed), "--duration", str(longest_s)),
         *("--trace", str(files.trace), "--json", str(files.result("edge-hil"))),
     ]
@@ -275,7 +292,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--duration", type=float, default=60.0, metavar="S", help="time to drive in s (default: 60)")
     p.add_argument("--seed", type=int, default=0, help="seed of the simulated world (default: 0)")
     p.add_argument("--people", type=int, default=4, help="walking people (default: 4)")
-    p.add_argument("--domain", type=int, help="DDS domain (default: a free one)")
+    p.add_argument("--robot", choices=tuple(ROBOTS), default=GO2.name, help=f"robot to drive (default: {GO2.name})")
+    p.add_argument("--domain", type=int, help="DDS domain of a robot with DDS (default: a free one)")
     p.add_argument("--json", metavar="FILE|-", help="also write demo.json's content to this file; - is stdout")
     return p
 
@@ -287,7 +305,7 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]
     try:
         domain = free_domain() if args.domain is None else args.domain
         artifacts = args.artifacts or args.out / "artifacts"
-        options = DemoOptions(args.out, artifacts, args.duration, args.seed, args.people, domain)
+        options = DemoOptions(args.out, artifacts, args.duration, args.seed, args.people, domain, ROBOTS[args.robot])
         _make_folder(options.log_dir)
     except (ValueError, OSError) as error:
         _print(str(error))
@@ -300,7 +318,7 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]
     except KeyboardInterrupt:
         _print("interrupted, all processes ended")
         return EXIT_INTERRUPTED
-    except (StepError, ReportError, CheckpointError, OSError) as error:
+    except (StepError, StackRobotError, ConfigError, ReportError, CheckpointError, OSError) as error:
         _print(str(error))
         return EXIT_CHECK_FAILED
     finally:

@@ -9,7 +9,7 @@ import socket
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from ipaddress import AddressValueError, IPv4Address, IPv4Network, NetmaskValueError
+from ipaddress import IPv4Network
 from pathlib import Path
 from stat import S_IROTH, S_IXOTH
 from typing import Any, Final
@@ -23,6 +23,7 @@ from edge.artifacts.target_facts import TargetFacts, target_facts
 from edge.artifacts.trust import STATE_DIRECTORY, Trust
 from edge.core.cli import EXIT_CHECK_FAILED, EXIT_DONE, write_result, write_whole
 from edge.deploy import units
+from edge.deploy.link_rights import Addresses, link_rights, robot_networks
 from edge.deploy.releases import LINK
 from edge.deploy.unit_check import MAX_EXPOSURE, UnitVerdict, check_units, systemd_version
 from edge.deploy.unit_text import (
@@ -36,15 +37,12 @@ from edge.deploy.unit_text import (
 )
 from edge.inference import engines
 from edge.run.instructions import check_first_instruction
-from firmware_bridge.core.config import DdsConfig, load_robot_config
+from firmware_bridge.core.config import RobotConfig, load_robot_config
 
 SYSTEM_UNITS: Final = Path("etc/systemd/system")
 SYSTEM_USERS: Final = Path("etc/sysusers.d")
 SYSTEM_RULES: Final = units.FIREWALL_FOLDER.relative_to("/")
 _MAX_INSTRUCTION_BYTES: Final = 16_384
-
-Addresses = Mapping[str, Sequence[tuple[str, str]]]
-"""Return the network interfaces' IPv4 addresses with their netmasks."""
 
 
 def interface_addresses() -> Addresses:
@@ -144,6 +142,9 @@ def run(args: argparse.Namespace, say: Callable[[str], None], host: Host | None 
     closed = unreadable(needed)
     for path in closed:
         say(f"{path}: the services cannot read it unless it is theirs: chmod o+rX {shlex.quote(str(path))}")
+    if (secret := inputs.link.secret) is not None:
+        key, user = shlex.quote(str(secret)), inputs.users.bridge
+        say(f"{secret}: only the bridge may read it: sudo chown {user}: {key} && sudo chmod 0600 {key}")
     _report_firewall(inputs, say)
     contents = _contents(args, inputs, host)
     written = _write(contents, force=args.force)
@@ -205,6 +206,9 @@ def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
     for program in ("edge-bridge", "edge-run"):
         if not (host.programs / program).exists():
             raise UnitError(f"{host.programs / program}: missing; install the package there: pip install tic-vla-edge")
+    dds = robot.dds
+    if dds is None and args.network:
+        raise UnitError(f"--network: expected none, found {args.network[0]}: protocol {robot.protocol} uses no DDS")
     providers = tuple(sorted({graph.session.provider for graph in artifacts.graphs.values()}))
     nodes = device_nodes(providers, host.root)
     folder = None
@@ -216,16 +220,16 @@ def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
         python=host.python,
         prefixes=host.prefixes,
         robot=args.robot.resolve(),
-        robot_files=tuple(path for path in (robot.odometry.calibration, robot.safety.estop_file) if path is not None),
+        robot_files=_robot_files(robot),
         artifacts=artifacts.directory,
         engines=folder,
         trust=None if args.trust is None else args.trust.resolve(),
         instruction=check_first_instruction(_instruction(args)),
         users=ServiceUsers(args.bridge_user, args.runner_user, args.operator_group),
-        interface=robot.network.interface,
-        domain=robot.network.domain,
-        networks=robot_networks(robot.network, args.network, host.addresses),
-        own=tuple(IPv4Network(address) for address, _ in host.addresses().get(robot.network.interface, ())),
+        interface="" if dds is None else dds.interface,
+        domain=0 if dds is None else dds.domain,
+        networks=() if dds is None else robot_networks(dds, args.network, host.addresses),
+        own=tuple(IPv4Network(address) for address, _ in host.addresses().get(dds.interface if dds else "", ())),
         nft=host.nft(),
         providers=providers,
         devices=tuple(node.path for node in nodes),
@@ -235,7 +239,14 @@ def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
         operator_arm=robot.safety.operator_arm,
         bridge_cores=_bridge_cores(artifacts, facts),
         systemd=host.systemd(),
+        link=link_rights(robot),
     )
+
+
+def _robot_files(robot: RobotConfig) -> tuple[Path, ...]:
+    """Return the files outside the package that the robot file names, without the bridge's secret."""
+    files = (robot.odometry.calibration, robot.safety.estop_file, None if robot.can is None else robot.can.dbc)
+    return tuple(path for path in files if path is not None and path.is_absolute())
 
 
 def unreadable(paths: Sequence[Path]) -> list[Path]:
@@ -268,42 +279,6 @@ def _bridge_cores(artifacts: Artifacts, facts: TargetFacts) -> tuple[int, ...]:
     return tuple(sorted(set(range(facts.cores)) - taken)) if taken else ()
 
 
-def robot_networks(dds: DdsConfig, given: Sequence[str], addresses: Callable[[], Addresses]) -> tuple[IPv4Network, ...]:
-    """Return the robot's networks: those given, else that of the robot file's interface and its peers.
-
-    Raises UnitError when the file alone does not determine them, or when a network is too wide for a filter.
-    """
-    networks: set[IPv4Network] = set()
-    for text in given:
-        try:
-            network = IPv4Network(text)
-        except (AddressValueError, NetmaskValueError, ValueError) as error:
-            raise UnitError(f"--network {text}: {error}; expected for example 192.168.123.0/24") from None
-        units.check_network(network, f"--network {text}")
-        networks.add(network)
-    if networks:
-        return tuple(sorted(networks))
-    own = addresses().get(dds.interface, ())
-    if not own:
-        raise UnitError(
-            f"the robot file's interface {dds.interface!r} has no IPv4 address here, so the robot's network is "
-            f"unknown: bring it up or give --network, e.g. 192.168.123.0/24"
-        )
-    networks.update(IPv4Network(f"{address}/{mask}", strict=False) for address, mask in own)
-    for network in networks:
-        units.check_network(network, f"the robot file's interface {dds.interface}")
-    for peer in dds.peers:
-        try:
-            address = IPv4Address(peer)
-        except AddressValueError:
-            raise UnitError(
-                f"dds.peers: {peer!r} is no IPv4 address; give the robot's network with --network"
-            ) from None
-        if not any(address in network for network in networks):
-            networks.add(IPv4Network(address))
-    return tuple(sorted(networks))
-
-
 def _contents(args: argparse.Namespace, inputs: units.ServiceInputs, host: Host) -> dict[Path, str]:
     """Return the text of every file by its path."""
     folder = host.root / SYSTEM_UNITS if args.system else args.out.absolute()
@@ -313,7 +288,7 @@ def _contents(args: argparse.Namespace, inputs: units.ServiceInputs, host: Host)
     }
     users = host.root / SYSTEM_USERS if args.system else folder
     contents[users / SYSUSERS_FILE] = sysusers(inputs.users)
-    if not inputs.over_loopback:
+    if inputs.on_cable:
         rules = host.root / SYSTEM_RULES if args.system else folder
         contents[rules / units.FIREWALL_FILE] = units.firewall_rules(inputs)
         if inputs.nft is not None:
@@ -322,7 +297,7 @@ def _contents(args: argparse.Namespace, inputs: units.ServiceInputs, host: Host)
 
 
 def _report_firewall(inputs: units.ServiceInputs, say: Callable[[str], None]) -> None:
-    if inputs.over_loopback:
+    if not inputs.on_cable:
         return
     if inputs.nft is None:
         say("nft is not on this machine, so nothing loads the firewall: sudo apt install nftables, then run this again")

@@ -17,6 +17,7 @@ from typing import Final
 from edge.artifacts.trust import STATE_DIRECTORY
 from edge.core.device import CUDA, OPENVINO, TENSORRT
 from edge.deploy import firewall
+from edge.deploy.link_rights import DDS_ONLY, LinkRights, check_network, device_lines
 from edge.deploy.unit_text import ServiceUsers, Setting, UnitError, argument, bound, render, word
 from firmware_bridge.core.config import BRIDGE_PRIORITY
 
@@ -35,8 +36,6 @@ RESTART_STEPS_SINCE: Final = 254
 BRIDGE_MEMORY: Final = "256M"
 RUNNER_MEMORY_SHARE: Final = "75%"
 """Share of the machine's memory for the runner where the target gives none; a choice of ours."""
-WIDEST_PREFIX: Final = 16
-"""Shortest prefix of a network that the address filter lets through, bits: a wider one filters hardly anything."""
 HIDDEN: Final = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
 """Folders hidden from a hardened service; units bind only the required files from there."""
 
@@ -65,11 +64,12 @@ class ServiceInputs:
     instruction: str
     users: ServiceUsers
     interface: str
-    """The robot file's interface; "lo": a simulated robot on this machine, without network target and filter."""
+    """The robot file's interface; "lo": a simulated robot on this machine, without network target and filter. Empty
+    without DDS."""
     domain: int
     """DDS domain."""
     networks: tuple[IPv4Network, ...]
-    """Networks of the robot."""
+    """Networks of the robot; none without DDS."""
     own: tuple[IPv4Network, ...]
     """This machine's addresses on that interface, by which the bridge detects other local programs' requests."""
     nft: Path | None
@@ -90,6 +90,7 @@ class ServiceInputs:
     """Cores that the target leaves to neither of the runner's threads; empty: any."""
     systemd: int | None
     """Version of the machine's systemd; None: unknown, so only keys of version 249 are written."""
+    link: LinkRights = DDS_ONLY
 
     def __post_init__(self) -> None:
         for name in ("programs", "python", "robot", "artifacts", *(("engines",) if self.engines else ())):
@@ -98,7 +99,7 @@ class ServiceInputs:
         for program in (self.programs, self.python):
             if set(str(program)) & set("'\"\\"):
                 raise UnitError(f"{program}: systemd takes no program with quotes or backslashes in its path; move it")
-        if not self.networks:
+        if self.link.uses_dds and not self.networks:
             raise UnitError("the robot's network is unknown: give it with --network, e.g. 192.168.123.0/24")
         for network in collapse_addresses(self.networks):
             check_network(network, "networks")
@@ -113,23 +114,14 @@ class ServiceInputs:
             )
 
     @property
-    def over_loopback(self) -> bool:
-        """Whether the robot is simulated on this machine."""
-        return self.interface == "lo"
-
-
-def check_network(network: IPv4Network, source: str) -> None:
-    """Raise UnitError for a network too wide for a useful filter; loopback never leaves the machine."""
-    if network.prefixlen < WIDEST_PREFIX and not network.is_loopback:
-        raise UnitError(
-            f"{source}: {network} has {network.num_addresses} addresses, expected a prefix of /{WIDEST_PREFIX} or "
-            f"longer: give the robot's own network with --network, e.g. 192.168.123.0/24"
-        )
+    def on_cable(self) -> bool:
+        """Whether the robot's DDS comes over a network interface, which needs a firewall."""
+        return self.link.uses_dds and self.interface != "lo"
 
 
 def bridge_unit(inputs: ServiceInputs) -> str:
     """Return the bridge's unit."""
-    users = inputs.users
+    users, secret = inputs.users, (inputs.link.secret,) if inputs.link.secret is not None else ()
     command = [word(str(inputs.programs / "edge-bridge"))]
     options = ("--robot", str(inputs.robot), "--socket", str(SOCKET), "--latch", str(LATCH))
     groups = ("--runner-group", users.runner, "--operator-group", users.operators)
@@ -140,7 +132,7 @@ def bridge_unit(inputs: ServiceInputs) -> str:
         ("ExecStart", " ".join(command)),
         ("User", users.bridge),
         "It gives its sockets to these groups; the runner is not in the second, so it can take back no emergency stop.",
-        ("SupplementaryGroups", f"{users.runner} {users.operators}"),
+        ("SupplementaryGroups", " ".join((users.runner, users.operators, *inputs.link.bridge_groups))),
         *_ending(watchdog_s=1, start_s=20, stop_s=2),
         "Always, also after a clean exit: without it nothing can stop the robot.",
         ("Restart", "always"),
@@ -165,8 +157,8 @@ def bridge_unit(inputs: ServiceInputs) -> str:
         "Keeps an emergency stop over restarts and reboots until a person ends it.",
         ("StateDirectory", LATCH.parent.name),
         ("StateDirectoryMode", "0700"),
-        *_hardening(inputs, (inputs.robot, *inputs.robot_files)),
-        ("PrivateDevices", "yes"),
+        *_hardening(inputs, (inputs.robot, *inputs.robot_files, *secret), bridge=True),
+        *(device_lines(inputs.link.bridge_devices, ()) or [("PrivateDevices", "yes")]),
         ("ProcSubset", "pid"),
         ("MemoryDenyWriteExecute", "yes"),
         ("SystemCallFilter", "@system-service"),
@@ -224,7 +216,7 @@ def runner_unit(inputs: ServiceInputs) -> str:
         ("TasksMax", "512"),
         ("StateDirectory", STATE_DIRECTORY.name),
         ("StateDirectoryMode", "0700"),
-        *_hardening(inputs, needed),
+        *_hardening(inputs, needed, bridge=False),
         *_accelerator(inputs),
         ("SystemCallFilter", "@system-service"),
         ("SystemCallFilter", "~@privileged"),
@@ -235,7 +227,7 @@ def runner_unit(inputs: ServiceInputs) -> str:
         "connection ends with the old bridge. After: at shutdown the runner stops first.",
         ("Wants", BRIDGE_UNIT),
         ("After", BRIDGE_UNIT),
-        *([] if inputs.over_loopback else [("Wants", "network-online.target"), ("After", "network-online.target")]),
+        *([] if not inputs.on_cable else [("Wants", "network-online.target"), ("After", "network-online.target")]),
         *_behind_firewall(inputs),
         # A start that fails slowly must be counted too, so the window holds several of the longest starts.
         ("StartLimitIntervalSec", "900"),
@@ -301,7 +293,7 @@ def _render(which: str, sections: dict[str, list[Setting | str]]) -> str:
 
 def _behind_firewall(inputs: ServiceInputs) -> list[Setting | str]:
     """Return the firewall's dependency: Wants, not Requires, since the robot needs a bridge without firewall too."""
-    if inputs.over_loopback or inputs.nft is None:
+    if not inputs.on_cable or inputs.nft is None:
         return []
     return [("Wants", FIREWALL_UNIT), ("After", FIREWALL_UNIT)]
 
@@ -326,16 +318,19 @@ def _ending(*, watchdog_s: int, start_s: int, stop_s: int) -> list[Setting | str
     ]
 
 
-def _hardening(inputs: ServiceInputs, needed: Sequence[Path]) -> list[Setting | str]:
+def _hardening(inputs: ServiceInputs, needed: Sequence[Path], *, bridge: bool) -> list[Setting | str]:
     """Return the restrictions of both services; `needed`: paths that they read besides Python."""
-    allowed = dict.fromkeys((*inputs.networks, *inputs.own, firewall.MULTICAST))
-    networks = " ".join(str(network) for network in allowed)
+    link = inputs.link
+    dds = (*inputs.networks, *inputs.own, firewall.MULTICAST) if link.uses_dds else ()
+    other = link.host if bridge else link.camera_host
+    networks = " ".join(dict.fromkeys(str(network) for network in (*dds, other) if network is not None))
+    families = ("AF_UNIX", *(("AF_INET",) if networks else ()), "AF_NETLINK", *(link.families if bridge else ()))
     hidden = sorted({str(path) for path in (*inputs.prefixes, *needed) if is_hidden(path)})
     return [
         "The robot's network and nothing else: its body is an unauthenticated peer.",
         ("IPAddressDeny", "any"),
-        ("IPAddressAllow", networks),
-        ("RestrictAddressFamilies", "AF_UNIX AF_INET AF_NETLINK"),
+        *((("IPAddressAllow", networks),) if networks else ()),
+        ("RestrictAddressFamilies", " ".join(families)),
         ("CapabilityBoundingSet", ""),
         ("ProtectHome", "tmpfs" if hidden else "yes"),
         *((("BindReadOnlyPaths", " ".join(bound(path) for path in hidden)),) if hidden else ()),
@@ -378,15 +373,16 @@ def is_hidden(path: Path) -> bool:
 
 
 def _accelerator(inputs: ServiceInputs) -> list[Setting | str]:
-    """Return the device access of the graphs' providers: none on a processor, the device's nodes otherwise."""
+    """Return the runner's device access: its camera's and the nodes of the graphs' providers, none on a processor."""
+    camera, groups = inputs.link.camera_devices, inputs.link.camera_groups
     if not set(inputs.providers) & set(_COMPILES):
         # No PrivateUsers: it hides the bridge's user id, by which the runner recognises an impostor.
-        return [("PrivateDevices", "yes"), ("MemoryDenyWriteExecute", "yes")]
-    nodes: list[Setting | str] = [("DeviceAllow", f"{word(str(node))} rw") for node in inputs.devices]
-    if not nodes and set(inputs.providers) & set(NEED_DEVICES):
-        nodes = ["DeviceAllow= is missing: no device of these providers was found where this was written."]
+        return [*(device_lines(camera, groups) or [("PrivateDevices", "yes")]), ("MemoryDenyWriteExecute", "yes")]
+    needs = set(inputs.providers) & set(NEED_DEVICES) and not inputs.devices
+    missing = ["DeviceAllow= is missing: no device of these providers was found where this was written."]
+    nodes = (*(word(str(node)) for node in inputs.devices), *camera)
     return [
         "These providers compile code at run time and use devices: no PrivateDevices, no MemoryDenyWriteExecute.",
-        *nodes,
-        *((("SupplementaryGroups", " ".join(inputs.groups)),) if inputs.groups else ()),
+        *(missing if needs else ()),
+        *device_lines(nodes, tuple(dict.fromkeys((*inputs.groups, *groups)))),
     ]

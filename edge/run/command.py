@@ -42,7 +42,7 @@ from edge.run.session import RunSession
 from edge.state.switches import Decoding, RecoverySwitch, SwitchOptions
 from firmware_bridge.client import BridgeUnavailable
 from firmware_bridge.core.config import ConfigError, RobotConfig, load_robot_config
-from firmware_bridge.core.robot_state import DdsError
+from firmware_bridge.core.robot_state import LinkOpenError
 
 EXAMPLES = """examples:
   edge-run --artifacts out/nano --robot go2.toml --instruction "walk to the vending machine"
@@ -222,7 +222,7 @@ def _run(args: argparse.Namespace, say: Callable[[str], None], sessions: list[Ru
     except CalibrationError as error:
         say(str(error))
         return EXIT_BAD_INPUT
-    except (RefusedError, ArtifactError, BridgeUnavailable, DdsError) as error:
+    except (RefusedError, ArtifactError, BridgeUnavailable, LinkOpenError) as error:
         say(str(error))
         return EXIT_REFUSED
     for fault in result["faults"]:

@@ -23,6 +23,7 @@ from edge.odometry.estimator import DriftEstimator, OdometryOutputs
 from edge.odometry.gate import OdometryInputs
 from edge.odometry.visual_odometry import VisualOdometry, grey_frame
 from edge.run.camera import CameraPoller
+from edge.run.robot_reader import open_reader
 from edge.safety.faults.findings import FindingQueue
 from edge.safety.monitors.robot import LinkMonitor
 from edge.state.frame import Frame
@@ -30,6 +31,7 @@ from edge.state.pose_history import PoseHistory
 from firmware_bridge.client import BridgeClient, BridgeStatus
 from firmware_bridge.core.config import RobotConfig
 from firmware_bridge.core.robot_state import BatteryState, RobotState
+from firmware_bridge.state_client import StateReader
 
 ODOMETRY_LOG_HZ = 50.0
 BATTERY_LOG_HZ = 1.0
@@ -54,7 +56,7 @@ class CommandTap:
 
 
 class RobotInputs:
-    """One robot's reports and pictures. Raises DdsError when the bus cannot be joined, CalibrationError."""
+    """One robot's reports and pictures. Raises LinkOpenError when its link cannot be opened, CalibrationError."""
 
     def __init__(
         self,
@@ -88,16 +90,15 @@ class RobotInputs:
         if mount is not None:
             hfov_rad, pitch_rad = math.radians(mount.hfov_deg), math.radians(mount.pitch_deg)
             self._eye = VisualOdometry(CameraGeometry(hfov_rad, mount.height_m, pitch_rad, mount.forward_m))
-        from firmware_bridge.unitree.client import Go2Reader  # needs the extra of its protocol
-
-        self.reader = Go2Reader(robot, on_death=on_death)
+        self.reader, self._source = open_reader(robot, on_death)
         self.reader.set_state_listener(self._on_state)
         self.camera = CameraPoller(
-            self.reader.request_frame,
+            self._source.request_frame,
             image_px=image_px,
             period_ns=max(period_ns, round(1e9 / robot.camera.rate_hz)),
             timeout_s=robot.camera.timeout_ms / 1e3,
             latency_ns=round(robot.camera.latency_ms * 1e6),
+            captured_ns=lambda: self._source.captured_ns,
             on_frame=self._see,
             on_death=on_death,
         )
@@ -106,6 +107,16 @@ class RobotInputs:
     def ready(self) -> bool:
         """Whether there has been a picture and a pose."""
         return self.camera.newest is not None and self.history.newest() is not None
+
+    def why_missing(self, status: BridgeStatus | None) -> str:
+        """Return in brackets why a pose or a picture is missing, as far as it is known; `status`: the bridge's.
+
+        Except with a Go2, only the bridge reads the robot's link and knows what is wrong with it.
+        """
+        why = self.camera.last_error
+        if self.history.newest() is None and isinstance(self.reader, StateReader):
+            why = self.reader.link_error or ("" if status is None else status.reason)
+        return f" ({why})" if why else ""
 
     @property
     def odometry(self) -> OdometryOutputs | None:
@@ -124,6 +135,7 @@ class RobotInputs:
     def close(self) -> None:
         """Stop asking and listening."""
         self.camera.close()
+        self._source.close()
         self.reader.close()
 
     def _on_state(self, state: RobotState) -> None:

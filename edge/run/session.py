@@ -135,8 +135,8 @@ class RunSession:
     def run(self) -> dict[str, Any]:
         """Arm, drive, stop; returns the result.
 
-        Raises RefusedError, ArtifactError, BridgeUnavailable, DdsError, CalibrationError or StoppedEarlyError before
-        the robot has moved.
+        Raises RefusedError, ArtifactError, BridgeUnavailable, LinkOpenError, CalibrationError or StoppedEarlyError
+        before the robot has moved.
         """
         refusal = None if self._options.record is None else space_refusal(self._options.record)
         if refusal is not None:
@@ -241,11 +241,10 @@ class RunSession:
                 raise StoppedEarlyError("stopped before the robot was armed")
             if self._finished.is_set():
                 raise RefusedError(self._faults[0])
-            bridge.poll()  # raises when the connection has ended
+            status = bridge.poll()  # raises when the connection has ended
             missing = "state" if inputs.history.newest() is None else "camera frame"
             if deadline.left_s() <= 0 and not waits:
-                why = f" ({inputs.camera.last_error})" if inputs.camera.last_error else ""
-                where = self._robot.address
+                where, why = self._robot.address, inputs.why_missing(status)
                 raise RefusedError(f"no {missing} from the robot in {READY_TIMEOUT_S:.0f} s on {where}{why}: is it on?")
             if waits:
                 self._reporter.on_wait(f"waiting for the robot: no {missing} yet")

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 import sys
-from dataclasses import MISSING, dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_args, get_type_hints
 
 from firmware_bridge.core.config_can import CanConfig
 from firmware_bridge.core.config_mavlink import MavlinkConfig
@@ -26,7 +26,6 @@ from firmware_bridge.core.sections import (
     MountConfig,
     OdometryConfig,
     SafetyConfig,
-    Section,
     require,
     runtime_dir,
     speed_hint,
@@ -144,9 +143,6 @@ class RobotConfig:
         return f"DDS domain {self.network.domain} on {self.network.interface}"
 
 
-_SECTIONS: Final = {kind.__name__.removesuffix("Config").lower(): kind for kind in Section.__subclasses__()}
-
-
 def load_robot_config(path: Path | str, *, socket: Path | None = None, domain: int | None = None) -> RobotConfig:
     """Read a robot file; `socket` and `domain` replace its own. Raises ConfigError with one clear line."""
     try:
@@ -170,7 +166,7 @@ def _build(cls: Any, table: object, prefix: str) -> Any:
     """Build dataclass `cls` from a TOML table; every key must exist, have the declared type and be finite."""
     if not isinstance(table, dict):
         raise ConfigError(f"[{prefix[:-1]}]: expected a table, found {table!r}")
-    declared = {each.name: each for each in fields(cls)}
+    declared, hints = {each.name: each for each in fields(cls)}, get_type_hints(cls)
     for key in table:
         require(key in declared, f"unknown key {prefix}{key}; expected {', '.join(declared)}")
     values: dict[str, Any] = {}
@@ -178,11 +174,16 @@ def _build(cls: Any, table: object, prefix: str) -> Any:
         if key not in table:
             optional = each.default is not MISSING or each.default_factory is not MISSING
             require(optional, f"missing key {prefix}{key}")
-        elif cls is RobotConfig and key in _SECTIONS:
-            values[key] = _build(_SECTIONS[key], table[key], f"{key}.")
+        elif (nested := _table_of(hints[key])) is not None:
+            values[key] = _build(nested, table[key], f"{prefix}{key}.")
         else:
             values[key] = _convert(table[key], str(each.type), prefix + key)
     return cls(**values)
+
+
+def _table_of(hint: Any) -> type | None:
+    """Return the dataclass of a field that is a table, required or not; None for a field with a value."""
+    return next((kind for kind in (hint, *get_args(hint)) if is_dataclass(kind) and isinstance(kind, type)), None)
 
 
 def _convert(value: object, kind: str, where: str) -> object:

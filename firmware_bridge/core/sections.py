@@ -6,7 +6,7 @@ import os
 import re
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 REMOTE_KEYS: Final = (
     *("R1", "L1", "start", "select", "R2", "L2", "F1", "F2"),
@@ -57,13 +57,16 @@ def within_range(low: float, high: float, default: Any = MISSING, *, above: bool
 
 @dataclass(frozen=True)
 class Section:
-    """A table of the robot file, named like its class; it checks the fields declared by `within_range`."""
+    """A table of the robot file, named like its class or `table_name`; checks the fields declared by `within_range`."""
+
+    table_name: ClassVar[str] = ""
 
     def __post_init__(self) -> None:
         for each in (each for each in fields(self) if "range" in each.metadata):
             (low, high, above), value = each.metadata["range"], getattr(self, each.name)
             inside = low <= value <= high and not (above and value == low)
-            key = f"{type(self).__name__.removesuffix('Config').lower()}.{each.name}"
+            table = self.table_name or type(self).__name__.removesuffix("Config").lower()
+            key = f"{table}.{each.name}"
             require(inside, f"{key}: expected {low:g}..{high:g}, found {value}{speed_hint(each.name, value)}")
 
 

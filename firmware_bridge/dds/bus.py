@@ -97,10 +97,9 @@ class Bus:
         return self._topics[name]
 
 
-def take_each(reader: DataReader[Any], limit: int = 64, max_bytes: int = MAX_SAMPLE_BYTES) -> Iterator[Any]:
-    """Take up to `limit` waiting samples one by one; a sample that does not decode is None, for the caller to count.
+def take_bytes(reader: DataReader[Any], limit: int = 64) -> Iterator[tuple[bytes, Any]]:
+    """Take up to `limit` waiting samples one by one without decoding them: (CDR bytes with header, sample info).
 
-    So is one of more than `max_bytes` as it came over the network: it is not decoded, which takes 50 ms a megabyte.
     Notices without data (a writer has left) are passed over.
     """
     for _ in range(limit):
@@ -110,9 +109,18 @@ def take_each(reader: DataReader[Any], limit: int = 64, max_bytes: int = MAX_SAM
         if not taken:
             return
         ((data, info),) = taken
-        if not info.valid_data:
-            continue
-        sample, kind = None, reader.topic.data_type
+        if info.valid_data:
+            yield data, info
+
+
+def take_each(reader: DataReader[Any], limit: int = 64, max_bytes: int = MAX_SAMPLE_BYTES) -> Iterator[Any]:
+    """Take up to `limit` waiting samples one by one; a sample that does not decode is None, for the caller to count.
+
+    So is one of more than `max_bytes` as it came over the network: it is not decoded, which takes 50 ms a megabyte.
+    """
+    kind = reader.topic.data_type
+    for data, info in take_bytes(reader, limit):
+        sample = None
         if len(data) <= max_bytes:
             with contextlib.suppress(Exception):  # the decoder of a hostile sample may raise anything
                 sample = kind.deserialize(data)

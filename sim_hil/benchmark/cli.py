@@ -48,6 +48,7 @@ from sim_hil.benchmark.workers.jobs import Backend, LocalJobs, RefusedRunError
 from sim_hil.benchmark.workers.progress import BenchProgress
 from sim_hil.benchmark.workers.realtime_episode import check_realtime, drivable
 from sim_hil.benchmark.workers.task import VIDEO_CHOICES
+from sim_hil.realtime.robots import GO2, ROBOTS
 from sim_hil.scene.scene import SceneError
 
 EXAMPLES = """examples:
@@ -57,6 +58,7 @@ EXAMPLES = """examples:
   edge-bench --suite dynanav --policy external:127.0.0.1:7001 --latency 1.5 --video failed --out out/theirs
   edge-bench --suite dynanav --policy expert --cluster 10.0.0.5:6379 --out out/expert
   edge-bench --suite dynanav --policy artifacts:out/nano --clock realtime --out out/here    # this machine's latency
+  edge-bench --suite dynanav --policy artifacts:out/nano --clock realtime --robot carter-can --out out/can
   edge-bench compare out/nano-2s out/nano-5s      # paired differences with intervals
   edge-bench report out/nano-2s                   # write report.html again
   edge-bench validate --help                      # check a suite: goals reachable, landmarks visible
@@ -93,8 +95,11 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument(
         "--clock", choices=CLOCKS, default="lockstep",
-        help="lockstep (default): virtual time, deterministic; realtime: edge-hil, edge-bridge and edge-run, go2 only",
+        help="lockstep (default): virtual time, deterministic; realtime: edge-hil, edge-bridge and edge-run",
     )  # fmt: skip
+    p.add_argument(
+        "--robot", choices=tuple(ROBOTS), help=f"realtime: robot that drives its body's episodes (default {GO2.name})"
+    )
     p.add_argument("--mode", choices=MODES, help="reasoning mode of an artifact policy (default async)")
     p.add_argument(
         "--latency", metavar="S|profile:FILE",
@@ -190,6 +195,7 @@ def conditions_of(args: argparse.Namespace) -> Conditions:
         stays=args.stay,
         camera=args.camera,
         external_timeout_s=args.external_timeout,
+        robot=args.robot or (GO2.name if args.clock == "realtime" else None),
     )
 
 
@@ -202,11 +208,12 @@ def _run(args: argparse.Namespace) -> int:
     skipped: list[str] = []
     if conditions.clock == "realtime":
         check_realtime(conditions, jobs=args.jobs, cluster=args.cluster is not None, video=args.video)
-        episodes, skipped = drivable(episodes)
+        robot = ROBOTS[conditions.robot or GO2.name]
+        episodes, skipped = drivable(episodes, robot)
         if skipped:
-            _report_problem(f"{len(skipped)} episodes skipped: edge-bridge drives only the go2", EXIT_DONE)
+            _report_problem(f"{len(skipped)} episodes skipped: their robot is not the {robot.hil_robot}", EXIT_DONE)
         if not episodes:
-            raise ConditionsError("--clock realtime: expected an episode of the go2 among --episodes, found none")
+            raise ConditionsError(f"--episodes: expected an episode of the {robot.hil_robot}, found none")
     episodes = list(reworded(episodes, conditions, lambda: load_suite(args.suite)))
     run = BenchRun.plan(args.suite, episodes, conditions)
     with _output_directory(args.out) as folder, stop_signals() as stop:

@@ -47,6 +47,7 @@ EPILOG: Final = """examples:
   edge-hil --robot carter --scene office --protocol can --link socketcan:can0
   edge-hil --robot carter --scene office --protocol mavlink --link udp:127.0.0.1:14580,to=127.0.0.1:14550
   edge-hil --robot carter --scene office --protocol mavlink --link udp:0.0.0.0:14580,camera=8091,system=2
+  edge-hil --robot carter --scene office --protocol ros2 --domain 5 --interface lo
   edge-hil --robot go2 --scene corridor --protocol unitree --duration 60 --trace run.jsonl --json -
   edge-hil --robot go2 --scene corridor --protocol unitree --odometry-noise severe --seed 7 --faults faults.sock
 --link of can: INTERFACE:CHANNEL[,camera=PORT][,FAULT=NUMBER...]
@@ -60,6 +61,8 @@ EPILOG: Final = """examples:
   IMPAIRMENT of both directions: loss_percent, loss_burst (mean length), delay_ms, jitter_ms (standard deviation),
              duplicate_percent, reorder_percent, reorder_ms (20)
   default    udp:127.0.0.1:14580,to=127.0.0.1:14540,to=127.0.0.1:14550
+ros2: the base stops by itself after 0.5 s without a Twist on /cmd_vel; it publishes /odom, /imu, /battery_state, /tf and
+  /camera/image/compressed with /camera/camera_info
 camera: TCP port of the HTTP camera stream, default 8090
 
 with --faults, a datagram with one JSON object switches a fault, such as {"fault": "camera-stop", "on": true}; the
@@ -113,8 +116,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--duration", type=float, metavar="S", help="end after S seconds (default: at SIGINT or SIGTERM)"
     )
-    parser.add_argument("--domain", type=int, metavar="N", help="unitree: DDS domain (default 0)")
-    parser.add_argument("--interface", metavar="NAME", help="unitree: network interface (default lo)")
+    parser.add_argument("--domain", type=int, metavar="N", help="unitree, ros2: DDS domain (default 0)")
+    parser.add_argument("--interface", metavar="NAME", help="unitree, ros2: network interface (default lo)")
     parser.add_argument("--link", metavar="ADDRESS", help="mavlink, can: address; forms and defaults below")
     parser.add_argument(
         "--camera", type=parse_size, default=(320, 180), metavar="WxH|none", help="camera image size (default 320x180)"

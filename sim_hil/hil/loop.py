@@ -103,6 +103,8 @@ class HilLoop:
                     name=command.name,
                     parameter=command.parameter,
                     request_id=command.request_id,
+                    velocity=command.velocity,
+                    source=command.source,
                 )
 
     def _step(self) -> None:

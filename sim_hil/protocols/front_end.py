@@ -49,6 +49,8 @@ class ReceivedCommand:
 
     `service`: addressed part of the protocol; `api_id`: the command's number there; `name`: its name in the protocol's
     documentation; `parameter`: its content as text; `request_id`: the sender's number, 0 if the protocol has none.
+    `velocity`: requested (vx m/s, vy m/s, wz rad/s) in the base's axes, zero for a stop, None without a valid motion.
+    `source`: number that the sender gives itself, 0 if the protocol has none.
     """
 
     received_ns: int
@@ -57,6 +59,8 @@ class ReceivedCommand:
     name: str
     parameter: str
     request_id: int = 0
+    velocity: tuple[float, float, float] | None = None
+    source: int = 0
 
 
 class FrontEnd(Protocol):

@@ -19,11 +19,11 @@ _FOLDER: Final = Path(__file__).parent
 Opener = Callable[[Simulation, FrontEndOptions], FrontEnd]
 
 _SPOKEN_BY: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
-    {"unitree": ("go2",), "mavlink": ("carter",), "can": ("carter",)}
+    {"unitree": ("go2",), "mavlink": ("carter",), "can": ("carter",), "ros2": ("carter",)}
 )
 
 FLAGS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
-    {"--domain": ("unitree",), "--interface": ("unitree",), "--link": ("mavlink", "can")}
+    {"--domain": ("unitree", "ros2"), "--interface": ("unitree", "ros2"), "--link": ("mavlink", "can")}
 )
 """Command-line options that only some protocols have."""
 

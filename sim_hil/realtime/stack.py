@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-import re
 import shutil
 import sys
 import tempfile
@@ -15,13 +13,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Literal
 
-import firmware_bridge
 from edge.state.switches import SwitchOptions
 from firmware_bridge.core.config import BRIDGE_PRIORITY
 from sim_hil.protocols.fault_socket import FaultClient
-from sim_hil.realtime.children import Child, Children, StepError, Tick, uninterrupted
+from sim_hil.realtime.children import Child, Children, Tick, uninterrupted
+from sim_hil.realtime.robots import BRIDGE_SOCKET, GO2, RunAddress, StackRobot
 
-ROBOT_FILE = Path(firmware_bridge.__file__).parent / "robots" / "go2_sim.toml"
 ProcessName = Literal["robot", "bridge", "runner"]
 READY_LINE = "edge-hil: ready"
 ARMED_LINE = "armed and driving"
@@ -51,6 +48,7 @@ class StackOptions:
     people: int
     seed: int
     domain: int
+    robot: StackRobot = GO2
     mode: str = "async"
     release_delay: str = "0"
     odometry_noise: str = "none"
@@ -84,7 +82,10 @@ class Stack:
         self.faults: FaultClient | None = None
         self._children = Children(options.folder, grace_s=GRACE_S)
         self._sockets = Path(tempfile.mkdtemp(prefix="tic-"))
-        self._robot_file = _robot_file(options)
+        self._address = RunAddress.free(self._sockets, options.domain)
+        file = options.folder / "robot.toml"
+        self.robot_file = options.robot.write_file(file, self._address, options.speed_limit_mps)
+        """The run's own robot file."""
 
     def __enter__(self) -> Stack:
         return self
@@ -127,10 +128,11 @@ class Stack:
         x_m, y_m, theta_rad = options.start
         command = [
             *COMMANDS["edge-hil"],
-            *("--robot", "go2", "--protocol", "unitree", "--interface", "lo", "--scene", options.scene),
+            *options.robot.hil_arguments(self._address),
+            *("--scene", options.scene),
             # One argument, because the value may begin with a minus.
             f"--start={x_m!r},{y_m!r},{math.degrees(theta_rad)!r}",
-            *("--people", str(options.people), "--seed", str(options.seed), "--domain", str(options.domain)),
+            *("--people", str(options.people), "--seed", str(options.seed)),
             *("--odometry-noise", options.odometry_noise),
             *("--trace", str(self.trace), "--json", str(self.result("edge-hil"))),
         ]
@@ -150,7 +152,7 @@ class Stack:
 
         Raises StepError.
         """
-        socket = self._sockets / "bridge"
+        socket = self._sockets / BRIDGE_SOCKET
         socket.unlink(missing_ok=True)  # left by a killed bridge
         name = f"edge-bridge-{self.runs + 1}"
         command = [*COMMANDS["edge-bridge"], *self._link(), "--json", str(self.result(name))]
@@ -202,25 +204,7 @@ class Stack:
         return child.process.returncode
 
     def _link(self) -> list[str]:
-        where = ["--socket", str(self._sockets / "bridge"), "--domain", str(self.options.domain)]
-        return ["--robot", str(self._robot_file), *where]
-
-
-def _robot_file(options: StackOptions) -> Path:
-    if options.speed_limit_mps is None:
-        return ROBOT_FILE
-    return slow_robot(options.folder, options.speed_limit_mps)
-
-
-def slow_robot(folder: Path, speed_limit_mps: float) -> Path:
-    """Write the simulated robot's file with another forward speed limit into `folder`. Raises StepError."""
-    line = f"vx_max_mps = {speed_limit_mps}"
-    text, changed = re.subn(r"^vx_max_mps *=.*$", line, ROBOT_FILE.read_text(encoding="utf-8"), flags=re.MULTILINE)
-    if changed != 1:
-        raise StepError(f"{ROBOT_FILE}: expected one line with vx_max_mps, found {changed}")
-    file = folder / "robot.toml"
-    file.write_text(text, encoding="utf-8")
-    return file
+        return ["--robot", str(self.robot_file)]
 
 
 def _text(log: Path) -> str:
@@ -236,20 +220,3 @@ def socket_dir() -> Iterator[Path]:
     finally:
         with uninterrupted():
             shutil.rmtree(folder, ignore_errors=True)
-
-
-def free_domain(udp_tables: Sequence[Path] = (Path("/proc/net/udp"), Path("/proc/net/udp6"))) -> int:
-    """Return a DDS domain in 1..90 with unused UDP ports (RTPS: 250 ports from 7400 + 250 · domain)."""
-    used: set[int] = set()
-    for table in udp_tables:
-        try:
-            for line in table.read_text(encoding="ascii").splitlines()[1:]:
-                used.add((int(line.split()[1].rsplit(":", 1)[1], 16) - 7400) // 250)
-        except OSError:
-            continue  # not Linux, or no IPv6
-    # From a different place in every process: two started together then rarely want the same one.
-    candidates = [1 + (os.getpid() + i) % 90 for i in range(90)]
-    for domain in candidates:
-        if domain not in used:
-            return domain
-    raise ValueError("no free DDS domain between 1 and 90; name one with --domain")

@@ -136,9 +136,9 @@ def read_trace(path: Path) -> TraceData:
             poses.append((line["x"], line["y"], line["theta"]))
             contacts += [(line["t_ns"], label) for label in line["touching"] if label not in touched]
             touched = set(line["touching"])
-        elif kind == "wire" and line["name"] in ("Move", "StopMove") and line["service"] == "sport":
-            # The bridge's own send time; the receive time includes delays of the simulator.
-            sent.append(int(line["request_id"]))
+        elif kind == "wire" and line["velocity"] is not None:
+            # The bridge's own send time where the protocol has one; the receive time includes the simulator's delays.
+            sent.append(int(line["request_id"] or line["t_ns"]))
         elif kind == "people" and poses and line["poses"]:
             x, y = poses[-1][:2]
             near.append((line["t_ns"], min(hypot(p[0] - x, p[1] - y) for p in line["poses"])))

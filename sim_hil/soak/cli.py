@@ -25,7 +25,7 @@ from edge.core.cli import (
 from firmware_bridge.core.config import load_robot_config
 from reporting.progress import Progress
 from sim_hil.realtime.children import StepError
-from sim_hil.realtime.stack import ROBOT_FILE, free_domain
+from sim_hil.realtime.robots import GO2, ROBOTS, free_domain
 from sim_hil.robots.odometry_noise import LEVELS
 from sim_hil.scene.scene import SceneError, load_scene
 from sim_hil.soak.faults import DEFAULT_MENU, SoakInputError, load_menu
@@ -45,9 +45,11 @@ EXAMPLES = """examples:
   edge-soak --artifacts out/nano --duration 8h --leg 30m --people 12 --scene hospital --scene office --out out/night
   edge-soak --artifacts out/nano --duration 8h --out out/night --resume      # with the same options, after a kill
   edge-soak --artifacts out/nano --duration 5m --faults none --json - --out out/quick
+  edge-soak --artifacts out/nano --duration 1h --robot carter-can --out out/carter
 
 A leg is one run of the stack (edge-hil, edge-bridge, edge-run) in one scene, with one task after another.
-Default budget and faults: sim_hil/soak/budget.toml and sim_hil/soak/faults.toml; copy and change them.
+Default budget and faults: sim_hil/soak/budget.toml and sim_hil/soak/faults.toml; copy and change them. Only the go2
+has the faults of the robot's side: other robots get those that end a process.
 exit codes: 0 budget met, 1 budget exceeded, undecided, or no leg could run, 2 bad arguments or input,
             3 refused (artifacts), 130 interrupted (a report of the finished part is written)
 """
@@ -93,7 +95,8 @@ def parser() -> argparse.ArgumentParser:
         metavar="MPS",
         help=f"forward speed limit (default: the robot file's; untrained weights: {UNTRAINED_MPS})",
     )
-    p.add_argument("--domain", type=int, metavar="N", help="DDS domain (default: a free one)")
+    p.add_argument("--robot", choices=tuple(ROBOTS), default=GO2.name, help=f"robot to drive (default {GO2.name})")
+    p.add_argument("--domain", type=int, metavar="N", help="DDS domain of a robot with DDS (default: a free one)")
     p.add_argument("--keep-logs", action="store_true", help="keep the flight logs (about 0.5 GiB an hour)")
     p.add_argument("--resume", action="store_true", help="continue the soak in --out for the remaining time")
     p.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
@@ -117,7 +120,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         options = options_of(args)
         menus = {"none": None, "default": DEFAULT_MENU}
         menu_file = menus.get(args.faults, Path(args.faults))
-        menu = None if menu_file is None else load_menu(menu_file)
+        menu = None if menu_file is None else load_menu(menu_file).for_robot(ROBOTS[args.robot])
         budget = applicable(load_budget(args.budget or DEFAULT_BUDGET), faults=menu is not None)
         soak = (SoakFolder.resume if args.resume else SoakFolder.create)(args.out.absolute(), options)
     except ArtifactError as error:
@@ -182,12 +185,13 @@ def options_of(args: argparse.Namespace) -> SoakOptions:
         seed=args.seed,
         duration_s=args.duration,
         leg_s=args.leg,
-        speed_mps=limit_mps or load_robot_config(ROBOT_FILE).limits.vx_max_mps,
+        speed_mps=limit_mps or load_robot_config(ROBOTS[args.robot].file).limits.vx_max_mps,
         speed_limit_mps=limit_mps,
         mode=args.mode,
         release_delay=args.release_delay,
         odometry_noise=args.odometry_noise,
         domain=free_domain() if args.domain is None else args.domain,
+        robot=args.robot,
         faults=args.faults,
     )
 

@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -17,6 +17,7 @@ import numpy as np
 from edge.safety.faults.table import FAULTS
 from sim_hil.protocols.fault_socket import FaultError
 from sim_hil.protocols.unitree.fault_commands import KINDS, FaultCommandError, Value, parse
+from sim_hil.realtime.robots import StackRobot
 from sim_hil.realtime.stack import Stack
 from sim_hil.scene.table import Table
 
@@ -105,6 +106,11 @@ class FaultMenu:
         names = [fault.name for fault in self.faults]
         if not names or len(set(names)) != len(names):
             raise SoakInputError("faults: expected one or more, with different names")
+
+    def for_robot(self, robot: StackRobot) -> FaultMenu:
+        """Return the faults that edge-hil or a signal can inject for this robot."""
+        faults = tuple(fault for fault in self.faults if fault.process is not None or robot.protocol == "unitree")
+        return replace(self, faults=faults)
 
 
 @dataclass(frozen=True)

@@ -94,7 +94,12 @@ class Leg:
         stack = asdict(self.options.stack)
         about = {
             **asdict(self.options),
-            "stack": {**stack, "folder": folder.name, "artifacts": str(stack["artifacts"])},
+            "stack": {
+                **stack,
+                "folder": folder.name,
+                "artifacts": str(stack["artifacts"]),
+                "robot": self.options.stack.robot.name,
+            },
         }
         (folder / LEG).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
         events, samples = (folder / name for name in (EVENTS, SAMPLES))

@@ -16,6 +16,7 @@ from edge.core.stats import percentiles
 from edge.flightlog.recorder import space_refusal
 from sim_hil.protocols.fault_socket import FaultError
 from sim_hil.realtime.children import StepError
+from sim_hil.realtime.robots import ROBOTS
 from sim_hil.realtime.stack import StackOptions
 from sim_hil.realtime.truth import read_lines
 from sim_hil.scene.scene import Vec3, load_scene
@@ -52,6 +53,8 @@ class SoakOptions:
     release_delay: str
     odometry_noise: str
     domain: int
+    robot: str
+    """Name of the robot (sim_hil.realtime.robots)."""
     faults: str
     """Value of --faults: default, none, or the path of a fault menu."""
 
@@ -162,7 +165,8 @@ def run_legs(
         folder = soak.folder(number)
         folder.mkdir(parents=True, exist_ok=True)
         scene = options.scenes[(number - 1) % len(options.scenes)]
-        journey = Journey(load_scene(scene), options.seed, number, options.speed_mps)
+        body = ROBOTS[options.robot].hil_robot
+        journey = Journey(load_scene(scene), options.seed, number, options.speed_mps, body)
         stack = _stack_options(options, number, folder, scene, journey.begin(), faults=menu is not None)
         leg_options = LegOptions(number, options.seed, min(options.leg_s, left_s), options.speed_mps, stack)
         leg = Leg(leg_options, journey, menu, stopped=stopped, show_status=show_status)
@@ -195,6 +199,7 @@ def _stack_options(
         people=options.people,
         seed=int(np.random.default_rng((options.seed, 63, number)).integers(2**31)),
         domain=options.domain,
+        robot=ROBOTS[options.robot],
         mode=options.mode,
         release_delay=options.release_delay,
         odometry_noise=options.odometry_noise,

@@ -13,9 +13,8 @@ from sim_hil.benchmark.env.metrics import spl
 from sim_hil.benchmark.language.instructions import WordingError, wordings
 from sim_hil.benchmark.language.route import RouteError
 from sim_hil.benchmark.language.tasks import goal_before, goals, make_task, sample_task
-from sim_hil.benchmark.suite.robots import footprint_m
+from sim_hil.benchmark.suite.robots import robot_grid
 from sim_hil.realtime.truth import TruePose
-from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.scene.scene import Scene, SceneObject, Vec2, Vec3
 
 THRESHOLD_M: Final = 1.5  # paper, equation 6
@@ -42,10 +41,11 @@ class SoakTask:
 class Journey:
     """Random sequence of tasks in one scene. Raises ValueError for a scene without free space or landmarks."""
 
-    def __init__(self, scene: Scene, seed: int, leg: int, speed_mps: float) -> None:
+    def __init__(self, scene: Scene, seed: int, leg: int, speed_mps: float, robot: str = "go2") -> None:
+        """`robot`: simulated robot whose size and largest step decide where it can drive."""
         self.scene = scene
         self._rng = np.random.default_rng((seed, 62, leg))
-        self._grid = NavGrid(scene, clearance_m=footprint_m("go2"))
+        self._grid = robot_grid(scene, robot)
         self._speed_mps = speed_mps
         self._length_m = (LENGTH_M[0], min(LENGTH_M[1], max(2 * LENGTH_M[0], LONGEST_S * speed_mps)))
         self._count = 0

@@ -16,7 +16,8 @@ import pytest
 
 from sim_hil.processes.child_process import last_lines
 from sim_hil.realtime.children import Children, StepError
-from sim_hil.realtime.stack import free_domain, socket_dir
+from sim_hil.realtime.robots import free_domain
+from sim_hil.realtime.stack import socket_dir
 from tools import demo
 from tools.report.machine import machine_facts
 
@@ -307,10 +308,13 @@ def test_the_trace_is_followed_while_it_is_written(tmp_path: Path) -> None:
     followed = demo.TraceTail(path)
     followed.update()
     pose = '{"t_ns": %d, "kind": "pose", "x": %f, "y": 0.0}\n'
-    path.write_text(pose % (1_000_000_000, 0.0) + '{"t_ns": 2, "kind": "wire", "name": "Move"}\n{"t_ns": 3, "ki')
+    path.write_text(pose % (1_000_000_000, 0.0) + '{"t_ns": 2, "kind": "wire", "velocity": [0, 0, 0]}\n{"t_ns": 3, "ki')
     followed.update()
     assert (followed.moves, followed.walked_m) == (1, 0.0)
     with path.open("a") as stream:
-        stream.write('nd": "wire", "name": "Move"}\n' + pose % (2_100_000_000, 0.5))
+        stream.write(
+            'nd": "wire", "velocity": null}\n{"t_ns": 4, "kind": "wire", "velocity": [0.5, 0, 0]}\n'
+            + pose % (2_100_000_000, 0.5)
+        )
     followed.update()
     assert (followed.moves, followed.walked_m) == (2, 0.5)

@@ -15,11 +15,12 @@ from sim_hil.benchmark.workers import realtime_episode as realtime
 from sim_hil.benchmark.workers.realtime_episode import check_realtime, drivable
 from sim_hil.benchmark.workers.task import EpisodeTask
 from sim_hil.realtime.children import Child, Children, StepError
-from sim_hil.realtime.stack import StackOptions, slow_robot
+from sim_hil.realtime.robots import ROBOTS
+from sim_hil.realtime.stack import StackOptions
 from sim_hil.realtime.truth import TruePose
 
 POLICY = PolicySpec("artifacts", "out/nano")
-GOOD = Conditions(POLICY, clock="realtime", mode="async")
+GOOD = Conditions(POLICY, clock="realtime", mode="async", robot="go2")
 ALONE = {"jobs": 1, "cluster": False, "video": "none"}
 S = 1_000_000_000
 
@@ -31,9 +32,12 @@ def test_artifacts_on_one_stack_at_a_time_are_accepted() -> None:
 @pytest.mark.parametrize(
     ("conditions", "named"),
     [
-        (Conditions(PolicySpec("expert"), clock="realtime"), "--policy"),
-        (Conditions(POLICY, clock="realtime", mode="async", latency=LatencyProfile.constant(2.0)), "--latency"),
-        (Conditions(POLICY, clock="realtime", mode="async", camera="128x128"), "--camera"),
+        (Conditions(PolicySpec("expert"), clock="realtime", robot="go2"), "--policy"),
+        (
+            Conditions(POLICY, clock="realtime", mode="async", robot="go2", latency=LatencyProfile.constant(2.0)),
+            "--latency",
+        ),
+        (Conditions(POLICY, clock="realtime", mode="async", robot="go2", camera="128x128"), "--camera"),
     ],
 )
 def test_conditions_that_need_virtual_time_are_refused(conditions: Conditions, named: str) -> None:
@@ -47,11 +51,25 @@ def test_options_that_disturb_the_clock_are_refused(jobs: int, cluster: bool, vi
         check_realtime(GOOD, jobs=jobs, cluster=cluster, video=video)
 
 
-def test_episodes_of_another_robot_are_left_out_by_name() -> None:
+@pytest.mark.parametrize(("robot", "body", "other"), [("go2", "go2", "carter"), ("carter-can", "carter", "go2")])
+def test_episodes_of_another_body_are_left_out_by_name(robot: str, body: str, other: str) -> None:
     suite = load_suite("dynanav")
-    kept, skipped = drivable(suite)
-    assert {episode.robot for episode in kept} == {"go2"}
-    assert len(kept) + len(skipped) == len(suite) and all("carter" in name for name in skipped)
+    kept, skipped = drivable(suite, ROBOTS[robot])
+    assert {episode.robot for episode in kept} == {body}
+    assert len(kept) + len(skipped) == len(suite) and all(other in name for name in skipped)
+
+
+def test_a_robot_is_named_with_real_time_alone() -> None:
+    with pytest.raises(ConditionsError, match="robot: expected one with clock realtime"):
+        Conditions(POLICY, clock="realtime", mode="async")
+    with pytest.raises(ConditionsError, match="robot: expected one with clock realtime"):
+        Conditions(PolicySpec("expert"), robot="go2")
+
+
+def test_a_result_in_real_time_from_before_there_were_other_robots_is_the_go2s() -> None:
+    content = GOOD.as_json()
+    del content["robot"]
+    assert Conditions.of_json(content).robot == "go2"
 
 
 def episode() -> Episode:
@@ -96,15 +114,6 @@ def test_the_true_path_is_sampled_as_in_lockstep(tmp_path: Path, monkeypatch: py
     with pytest.raises(StepError, match="edge-hil"):
         realtime.run_realtime(task, lambda _seconds: None)
     assert asked[asked.index("--pose-hz") + 1] == str(FRAME_HZ)
-
-
-def test_a_slow_robot_differs_in_its_speed_limit_alone(tmp_path: Path) -> None:
-    from firmware_bridge.core.config import load_robot_config
-    from sim_hil.realtime.stack import ROBOT_FILE
-
-    slow, standard = load_robot_config(slow_robot(tmp_path, 0.1)), load_robot_config(ROBOT_FILE)
-    assert slow.limits.vx_max_mps == 0.1 and standard.limits.vx_max_mps > 0.1
-    assert slow.limits.wz_max_radps == standard.limits.wz_max_radps and slow.bridge.rate_hz == standard.bridge.rate_hz
 
 
 def test_a_speed_limit_that_is_none_is_refused(tmp_path: Path) -> None:

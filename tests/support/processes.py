@@ -19,7 +19,7 @@ from pathlib import Path
 import pytest
 
 from edge.flightlog.recorder import space_refusal
-from sim_hil.realtime.stack import free_domain
+from sim_hil.realtime.robots import free_domain
 from tools.faults.host_stall import HostStall
 
 REPOSITORY = Path(__file__).resolve().parents[2]

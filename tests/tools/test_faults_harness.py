@@ -113,7 +113,7 @@ def test_the_plan_is_never_the_same_twice() -> None:
 
 
 def test_requests_are_distinguished_by_source_and_time(tmp_path: Path) -> None:
-    lines = [{"t_ns": t, "source": s, "api_id": 1008, "velocity": [0.1, 0, 0]} for t, s in ((1, 0), (2, 1), (3, 0))]
+    lines = [{"t_ns": t, "source": s, "velocity": [0.1, 0, 0]} for t, s in ((1, 0), (2, 1), (3, 0))]
     (tmp_path / "received").write_text("".join(json.dumps(line) + "\n" for line in lines))
     received = ReceivedCommands(tmp_path / "received")
     assert received.sources() == {0, 1} and [one.t_ns for one in received.since(2)] == [2, 3]

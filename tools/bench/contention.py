@@ -32,6 +32,7 @@ from edge.reasoning.generation_cycle import UNLIMITED, ReasoningBudget
 from edge.run import command as runner
 from edge.state.semantic import SemanticState
 from sim_hil.realtime.children import Children, StepError
+from sim_hil.realtime.robots import GO2
 from sim_hil.realtime.stack import socket_dir
 from tools.bench import bad_input, command_parser
 from tools.bench.stop import start_robot
@@ -148,7 +149,7 @@ def summarise(ticks: Sequence[Tick], missed: int, generations: int, busy: float)
 
 def _run(artifacts: Path, duration_s: float, folder: Path) -> tuple[list[Tick], int, float, int]:
     with Children(folder) as children:
-        link = start_robot(children, folder)
+        link = start_robot(children, folder, GO2)
         log = folder / "flight.mcap"
         run = [sys.executable, "-m", "tools.bench.contention", DRIVE, *link, "--artifacts", str(artifacts)]
         run += ["--instruction", INSTRUCTION, "--duration", str(duration_s), "--record", str(log)]

@@ -20,7 +20,8 @@ from pathlib import Path
 
 from edge.core.cli import EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
 from sim_hil.realtime.children import Child, Children, StepError
-from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_FILE, free_domain, socket_dir
+from sim_hil.realtime.robots import GO2, ROBOTS, RunAddress, StackRobot
+from sim_hil.realtime.stack import COMMANDS, READY_LINE, socket_dir
 from tools.bench import bad_input, command_parser
 from tools.demo import INSTRUCTION
 
@@ -35,13 +36,13 @@ Moves = list[tuple[int, tuple[float, float, float]]]
 
 
 def received_moves(trace: Path) -> Moves:
-    """Return (stamp ns, velocity) of every Move in a trace of edge-hil; ignores an incomplete last line."""
+    """Return (stamp ns, velocity) of every motion request in a trace of edge-hil; ignores an incomplete last line."""
     moves: Moves = []
     for line in trace.read_text(encoding="utf-8").split("\n")[:-1]:
         record = json.loads(line)
-        if record["kind"] == "wire" and record["name"] == "Move":
-            velocity = json.loads(record["parameter"])
-            moves.append((record["t_ns"], (velocity["x"], velocity["y"], velocity["z"])))
+        if record["kind"] == "wire" and record["velocity"] is not None:
+            vx_mps, vy_mps, wz_radps = record["velocity"]
+            moves.append((record["t_ns"], (vx_mps, vy_mps, wz_radps)))
     return moves
 
 
@@ -54,12 +55,12 @@ def lasting_zero_ms(moves: Moves, signal_ns: int) -> float:
     return (after[last_motion + 1][0] - signal_ns) / 1e6
 
 
-def start_robot(children: Children, folder: Path, options: Sequence[str] = ()) -> list[str]:
+def start_robot(children: Children, folder: Path, robot: StackRobot, options: Sequence[str] = ()) -> list[str]:
     """Start edge-hil with its options and edge-bridge; returns the runner's arguments to reach them."""
-    domain = ["--domain", str(free_domain())]
-    link = ["--robot", str(ROBOT_FILE), "--socket", str(folder / "b.sock"), *domain]
-    scene = ["--robot", "go2", "--scene", "corridor", "--protocol", "unitree", "--people", "0"]
-    hil = children.start("edge-hil", [*COMMANDS["edge-hil"], *scene, *options, *domain])
+    address = RunAddress.free(folder)
+    link = ["--robot", str(robot.write_file(folder / "robot.toml", address))]
+    scene = [*robot.hil_arguments(address), "--scene", "corridor", "--people", "0"]
+    hil = children.start("edge-hil", [*COMMANDS["edge-hil"], *scene, *options])
     children.wait_until(hil, lambda: READY_LINE in hil.log.read_text(), 90.0, "ready line", lambda: None)
     children.start("edge-bridge", [*COMMANDS["edge-bridge"], *link])
     return link
@@ -89,6 +90,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     p = command_parser(__doc__, artifacts=True)
     p.add_argument("--runs", type=int, default=20, help="runs of each signal (default: 20)")
+    p.add_argument("--robot", choices=tuple(ROBOTS), default=GO2.name, help=f"robot (default: {GO2.name})")
     args = p.parse_args(argv)
     rng = random.Random(0)
     samples: dict[str, list[float]] = {number.name: [] for number in SIGNALS}
@@ -98,7 +100,7 @@ def main(argv: list[str] | None = None) -> int:
             raise ValueError(f"--runs {args.runs}: expected at least 1")
         with socket_dir() as folder, Children(folder) as children:
             trace = folder / "trace.jsonl"
-            link = start_robot(children, folder, ["--trace", str(trace)])
+            link = start_robot(children, folder, ROBOTS[args.robot], ["--trace", str(trace)])
             runner = [*COMMANDS["edge-run"], *link, "--artifacts", str(args.artifacts), "--instruction", INSTRUCTION]
             for index in range(args.runs):
                 for number in SIGNALS:
@@ -112,7 +114,14 @@ def main(argv: list[str] | None = None) -> int:
         for name, values in samples.items()
     }
     ok = all(row["max"] <= BOUND_MS for row in summary.values())
-    result = {"stop_ms": summary, "bound_ms": BOUND_MS, "ok": ok, "samples_ms": samples, "tagged": "measured"}
+    result = {
+        "robot": args.robot,
+        "stop_ms": summary,
+        "bound_ms": BOUND_MS,
+        "ok": ok,
+        "samples_ms": samples,
+        "tagged": "measured",
+    }
     write_result(args.json, result)
     if args.json != "-":
         for name, row in summary.items():

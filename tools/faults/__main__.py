@@ -31,7 +31,8 @@ from edge.core.cli import (
 from edge.flightlog.recorder import space_refusal
 from sim_hil.protocols.fault_socket import FaultError
 from sim_hil.realtime.children import StepError, uninterrupted
-from sim_hil.realtime.stack import free_domain, socket_dir
+from sim_hil.realtime.robots import GO2, ROBOTS
+from sim_hil.realtime.stack import socket_dir
 from tools.faults.host_stall import HostStall
 from tools.faults.measure import Sample, injection
 from tools.faults.report import RowResult, result, show
@@ -63,7 +64,8 @@ def parser() -> argparse.ArgumentParser:
         "--per-row", type=int, default=5, metavar="N", help="injections a row; slow rows get fewer (default: 5)"
     )
     p.add_argument("--seed", type=int, default=0, help="seed of the injection times (default: 0)")
-    p.add_argument("--domain", type=int, metavar="N", help="DDS domain (default: a free one)")
+    p.add_argument("--robot", choices=tuple(ROBOTS), default=GO2.name, help=f"robot to drive (default: {GO2.name})")
+    p.add_argument("--domain", type=int, metavar="N", help="DDS domain of a robot with DDS (default: a free one)")
     p.add_argument("--list", action="store_true", help="print the rows with their criteria and exit")
     p.add_argument("--json", metavar="FILE|-", help="also write the result to this file; - is stdout")
     return p
@@ -127,7 +129,7 @@ def run(args: argparse.Namespace, wanted: Sequence[Row]) -> list[RowResult]:
     Raises StepError if no flight could be recorded, FaultError if edge-hil does not answer.
     """
     results: list[RowResult] = []
-    domain = free_domain() if args.domain is None else args.domain
+    robot = ROBOTS[args.robot]
     with ExitStack() as stack:
         folder = stack.enter_context(socket_dir())
         refusal = space_refusal(folder / "flight.mcap")
@@ -135,8 +137,8 @@ def run(args: argparse.Namespace, wanted: Sequence[Row]) -> list[RowResult]:
             raise StepError(f"{folder}: {refusal}")
         stack.callback(keep_logs, folder, args.out)
         host = stack.enter_context(HostStall())
-        rig = stack.enter_context(Rig(folder, args.artifacts.absolute(), domain, _print))
-        _print(f"starting the robot's side in domain {domain}")
+        rig = stack.enter_context(Rig(folder, args.artifacts.absolute(), args.domain, _print, stack_robot=robot))
+        _print(f"starting the robot's side: {robot.name}, {rig.config.address}")
         rig.start()
         rng = random.Random(args.seed)
         for row in wanted:

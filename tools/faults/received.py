@@ -1,4 +1,4 @@
-"""Requests received by the sniffer, and pure functions that judge the commands among them."""
+"""Motion requests received on the robot's side, and pure functions that judge them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from firmware_bridge.unitree.messages import ids
 from sim_hil.realtime.truth import LineTail
 
 Velocity = tuple[float, float, float]
@@ -17,21 +16,20 @@ KEEP_NS = 120_000_000_000
 
 @dataclass(frozen=True)
 class ReceivedCommand:
-    """Request of the sport service; `velocity` only for a Move."""
+    """Request that reached the robot; `velocity` only for one that requests motion or its end."""
 
     t_ns: int
     source: int
-    api_id: int
     velocity: Velocity | None
 
     @property
     def moving(self) -> bool:
-        """Whether it is a Move other than zero."""
+        """Whether it requests motion."""
         return self.velocity is not None and any(self.velocity)
 
 
 class ReceivedCommands:
-    """Requests received by the sniffer in the last two minutes."""
+    """Requests of the last two minutes, from the sniffer's file or from edge-hil's trace."""
 
     def __init__(self, path: Path) -> None:
         self._tail = LineTail(path)
@@ -40,11 +38,11 @@ class ReceivedCommands:
     def update(self) -> None:
         """Read the lines that the robot has written since the last call."""
         for line in self._tail.lines():
+            if line.get("kind", "wire") != "wire":
+                continue
             found = line["velocity"]
             velocity = (float(found[0]), float(found[1]), float(found[2])) if isinstance(found, list) else None
-            self._requests.append(
-                ReceivedCommand(int(line["t_ns"]), int(line["source"]), int(line["api_id"]), velocity)
-            )
+            self._requests.append(ReceivedCommand(int(line["t_ns"]), int(line["source"]), velocity))
         while self._requests and self._requests[-1].t_ns - self._requests[0].t_ns > KEEP_NS:
             self._requests.popleft()
 
@@ -59,15 +57,15 @@ class ReceivedCommands:
         return frozenset(request.source for request in self._requests)
 
     def last_moves(self, count: int) -> list[ReceivedCommand]:
-        """Return the newest Moves, oldest first."""
+        """Return the newest motion requests, oldest first."""
         self.update()
         moves = [request for request in self._requests if request.velocity is not None]
         return moves[-count:]
 
 
 def moves(requests: Iterable[ReceivedCommand]) -> list[tuple[int, Velocity]]:
-    """Return (ns, velocity) of every Move."""
-    return [(one.t_ns, one.velocity) for one in requests if one.api_id == ids.MOVE and one.velocity is not None]
+    """Return (ns, velocity) of every motion request."""
+    return [(one.t_ns, one.velocity) for one in requests if one.velocity is not None]
 
 
 def first_lasting(stamped: Sequence[tuple[int, Velocity]], limit: Velocity) -> int | None:

@@ -1,4 +1,8 @@
-"""Rig of robot's side, sniffer, bridge and runner as real processes on loopback, with the operations of the faults."""
+"""Rig of robot's side, bridge and runner as real processes on loopback, with the operations of the faults.
+
+A robot on DDS also gets a sniffer, which stamps requests in a process of its own and distinguishes their writers. The
+other protocols' front ends stamp what they receive in a thread of their own; it is in the trace of edge-hil.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +20,8 @@ from firmware_bridge.core.config import RobotConfig, load_robot_config
 from sim_hil.processes.child_process import last_lines
 from sim_hil.protocols.fault_socket import FaultClient, FaultError
 from sim_hil.realtime.children import Child, Children, StepError
-from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_FILE
+from sim_hil.realtime.robots import BRIDGE_SOCKET, GO2, RunAddress, StackRobot
+from sim_hil.realtime.stack import COMMANDS, READY_LINE
 from sim_hil.realtime.truth import LineTail
 from tools.demo import INSTRUCTION
 from tools.faults.circle import SPEED_MPS
@@ -36,16 +41,29 @@ def _has_printed(child: Child, text: str) -> bool:
 
 
 class Rig:
-    """Processes of one DDS domain; the context manager ends only processes that it started."""
+    """Processes of one robot; the context manager ends only processes that it started."""
 
     def __init__(
-        self, folder: Path, artifacts: Path, domain: int, log: Callable[[str], None], *, record: bool = True
+        self,
+        folder: Path,
+        artifacts: Path,
+        domain: int | None,
+        log: Callable[[str], None],
+        *,
+        record: bool = True,
+        stack_robot: StackRobot = GO2,
     ) -> None:
-        """Create the rig with sockets and logs in `folder`; a socket's path has at most 107 bytes."""
+        """Create the rig with sockets and logs in `folder`; a socket's path has at most 107 bytes.
+
+        Raises StackRobotError for a robot that cannot be driven here.
+        """
         self.folder = folder
-        self.domain = domain
-        self.received = ReceivedCommands(folder / "received.jsonl")
-        self.config: RobotConfig = load_robot_config(ROBOT_FILE, socket=folder / "b.sock", domain=domain)
+        self.stack_robot = stack_robot
+        self.address = RunAddress.free(folder, domain)
+        self._robot_file = stack_robot.write_file(folder / "robot.toml", self.address)
+        self.config: RobotConfig = load_robot_config(self._robot_file)
+        self._sniffs = stack_robot.protocol == "unitree"
+        self.received = ReceivedCommands(folder / ("received.jsonl" if self._sniffs else "trace.jsonl"))
         self.jump_m = 1.0
         self.needs_operator = False
         self._artifacts = artifacts
@@ -82,13 +100,15 @@ class Rig:
 
     def start(self) -> None:
         """Start the robot's side and the sniffer, and wait for both. Raises StepError."""
-        scene = ["--robot", "go2", "--scene", "corridor", "--protocol", "unitree", "--people", "0"]
-        where = ["--domain", str(self.domain), "--trace", str(self.folder / "trace.jsonl")]
-        faults = ["--faults", str(self.folder / "hil.faults")]
-        sniffer = [sys.executable, "-m", "tools.faults.sniffer", "--domain", str(self.domain)]
-        self.hil = self._children.start("edge-hil", [*COMMANDS["edge-hil"], *scene, *where, *faults])
-        sniffing = self._children.start("sniffer", [*sniffer, "--out", str(self.folder / "received.jsonl")])
-        for child, line in ((sniffing, "sniffer: ready"), (self.hil, READY_LINE)):
+        scene = [*self.stack_robot.hil_arguments(self.address), "--scene", "corridor", "--people", "0"]
+        where = ["--trace", str(self.folder / "trace.jsonl"), "--faults", str(self.folder / "hil.faults")]
+        self.hil = self._children.start("edge-hil", [*COMMANDS["edge-hil"], *scene, *where])
+        waited = [(self.hil, READY_LINE)]
+        if self._sniffs:
+            sniffer = [sys.executable, "-m", "tools.faults.sniffer", "--domain", str(self.address.domain)]
+            child = self._children.start("sniffer", [*sniffer, "--out", str(self.folder / "received.jsonl")])
+            waited.append((child, "sniffer: ready"))
+        for child, line in waited:
             self._wait(partial(_has_printed, child, line), READY_TIMEOUT_S, child, line)
 
     def start_bridge(self) -> None:
@@ -180,7 +200,8 @@ class Rig:
 
     def _operator_arms(self) -> None:
         """Permit the waiting runner to arm, as an operator does. Raises StepError."""
-        command = [*COMMANDS["edge-bridge"], "arm", "--robot", str(ROBOT_FILE), "--socket", str(self.folder / "b.sock")]
+        socket = str(self.folder / BRIDGE_SOCKET)
+        command = [*COMMANDS["edge-bridge"], "arm", *self._link(), "--socket", socket]
         done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
         if done.returncode != 0:
             raise StepError(f"edge-bridge arm: exit code {done.returncode}: {done.stderr.strip()}")
@@ -194,7 +215,7 @@ class Rig:
 
     def rogue(self, duration_s: float) -> int:
         """Let a second commander drive for `duration_s` or slightly longer; returns its start, ns."""
-        command = [sys.executable, "-m", "tools.faults.rogue", "--domain", str(self.domain)]
+        command = [sys.executable, "-m", "tools.faults.rogue", "--domain", str(self.address.domain)]
         rogue = self._children.start("rogue", [*command, "--duration", str(duration_s)])
         try:
             self._wait(lambda: "ready" in rogue.log.read_text(), 30.0, rogue, "robot to command")
@@ -228,7 +249,7 @@ class Rig:
                 self._inside.inject("clear", timeout_s=1.0)
 
     def _link(self) -> list[str]:
-        return ["--robot", str(ROBOT_FILE), "--socket", str(self.folder / "b.sock"), "--domain", str(self.domain)]
+        return ["--robot", str(self._robot_file)]
 
     def _forget(self, child: Child | None) -> None:
         if child is not None:

@@ -2,7 +2,7 @@
 
     python -m tools.faults.sniffer --domain 7 --out received.jsonl
 
-One JSON object a line: {"t_ns": monotonic, "source": writer's number, "api_id": 1008, "velocity": [x, y, wz] or null}.
+One JSON object a line: {"t_ns": monotonic, "source": writer's number, "velocity": [x, y, wz] of a Move, or null}.
 It shares only the DDS reader and the parser of a Move with the tested code.
 """
 
@@ -54,7 +54,6 @@ def main(argv: list[str] | None = None) -> int:
                 line = {
                     "t_ns": t_ns,
                     "source": sources.setdefault(handle, len(sources)),
-                    "api_id": api_id,
                     "velocity": parse_move(sample.parameter) if api_id == ids.MOVE else None,
                 }
                 file.write(json.dumps(line) + "\n")

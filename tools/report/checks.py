@@ -6,8 +6,6 @@ Each function checks one property; `acceptance` lists them all. Limits that depe
 
 from __future__ import annotations
 
-import json
-import math
 from bisect import bisect_right
 from dataclasses import dataclass
 
@@ -28,8 +26,6 @@ REACHABLE_S = 60.0
 
 # A generation is stamped ready, then swapped in by another thread: a tick within this time may still see the old one.
 SWAP_RACE_NS = 10_000_000
-
-MOTION_COMMANDS = frozenset({"Move", "StopMove", "Damp", "StandDown"})
 
 
 @dataclass(frozen=True)
@@ -107,11 +103,11 @@ def motion_without_semantic_state(log: FlightLog) -> int:
 
 
 def moved_under_command_m(trace: Trace) -> float:
-    """Return the ground-truth path length, in 1 s steps, over the seconds with a non-zero Move on the wire, m.
+    """Return the ground-truth path length, in 1 s steps, over the seconds with a non-zero velocity on the wire, m.
 
     Steps of 1 s keep the body's sway while trotting in place out of the sum.
     """
-    moving_ns = np.array([w["t_ns"] for w in trace.wire if w["name"] == "Move" and any(move_velocity(w))], np.int64)
+    moving_ns = np.array([w["t_ns"] for w in trace.wire if w["velocity"] is not None and any(w["velocity"])], np.int64)
     total_m = 0.0
     edges_ns = np.arange(trace.pose_ns[0], trace.pose_ns[-1] + 1, 1_000_000_000)
     index = np.searchsorted(trace.pose_ns, edges_ns)
@@ -121,21 +117,11 @@ def moved_under_command_m(trace: Trace) -> float:
     return total_m
 
 
-def move_velocity(request: Record) -> tuple[float, float, float]:
-    """Read (vx, vy, wz) of a Move request; NaN (hence not zero) if it is unreadable."""
-    parameter = request["parameter"]
-    try:
-        fields = json.loads(parameter) if isinstance(parameter, str) else parameter
-        return float(fields["x"]), float(fields["y"]), float(fields["z"])
-    except (ValueError, KeyError, TypeError):
-        return math.nan, math.nan, math.nan
-
-
 def last_motion_command(trace: Trace) -> tuple[str, bool]:
     """Return the name of the last motion request on the wire and whether it requests zero velocity."""
     for request in reversed(trace.wire):
-        if request["name"] in MOTION_COMMANDS:
-            return request["name"], request["name"] != "Move" or not any(move_velocity(request))
+        if request["velocity"] is not None:
+            return request["name"], not any(request["velocity"])
     return "none", False
 
 

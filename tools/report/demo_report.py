@@ -21,7 +21,7 @@ from reporting.page import Cell, Figure, Table, mark, render
 from reporting.plot_style import delay_histogram
 from tools.report import figures
 from tools.report.checks import Check, acceptance
-from tools.report.numbers import Number, delay_at_call, headline, numbers
+from tools.report.numbers import Number, command_latency_ms, delay_at_call, headline, numbers
 from tools.report.run_data import (
     MISSHAPEN,
     Record,
@@ -44,6 +44,7 @@ class RunFiles:
     def __init__(self, out: Path, artifacts: Path) -> None:
         self.out, self.artifacts = out, artifacts
         self.settings = out / "settings.json"
+        self.robot = out / "robot.toml"
         self.flight_log = out / "flight.mcap"
         self.trace = out / "hil_trace.jsonl"
         self.report = out / "report.html"
@@ -56,7 +57,7 @@ class RunFiles:
     def of_a_run(self) -> list[Path]:
         """All files that a run writes; removed before the next run, so that no old result remains after a failure."""
         results = [self.result(command) for command in ("edge-run", "edge-hil", "edge-bridge")]
-        return [self.settings, self.flight_log, self.trace, self.report, self.summary, *results]
+        return [self.settings, self.robot, self.flight_log, self.trace, self.report, self.summary, *results]
 
 
 def load_run(files: RunFiles) -> RunData:
@@ -92,8 +93,10 @@ def write_report(files: RunFiles, *, wall_s: float) -> Record:
 def _summary(data: RunData, checks: Sequence[Check], wall_s: float) -> Record:
     run = data.results["edge-run"]
     return {
+        **{key: data.settings.get(key) for key in ("robot", "protocol")},
         **{key: run[key] for key in ("control", "reasoning", "delay_s", "delay_error_ms")},
         "bridge": data.results["edge-bridge"],
+        "command_latency_ms": command_latency_ms(data),
         "wire": data.trace.end.get("wire", data.results["edge-hil"].get("wire", {})),
         "checks": {check.name: check.as_json() for check in checks},
         "duration_s": data.duration_s,
@@ -124,6 +127,7 @@ def _page(data: RunData, checks: Sequence[Check], wall_s: float) -> str:
         passed=not failed,
         verdict=f"{failed} of {len(checks)} checks failed" if failed else f"all {len(checks)} checks passed",
         instruction=str(data.log.run.get("instruction", "not recorded")),
+        robot=_robot(data),
         scene=str(data.trace.scene["name"]),
         people=hil["people"],
         seed=hil["seed"],
@@ -162,6 +166,12 @@ def _page(data: RunData, checks: Sequence[Check], wall_s: float) -> str:
         if isinstance(machine, dict)
         else None,
     )
+
+
+def _robot(data: RunData) -> str:
+    """Return the robot's name and protocol; those of edge-hil's result alone for a run without them."""
+    name, protocol = data.settings.get("robot", data.results["edge-hil"]["robot"]), data.settings.get("protocol")
+    return str(name) if protocol is None else f"{name}, protocol {protocol}"
 
 
 def _cards(data: RunData) -> list[Record]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from reporting.plot_style import percentile
 from tools.report.checks import goal_distance_m, moved_under_command_m
+from tools.report.command_latency import command_latencies_ms
 from tools.report.run_data import Record, RunData, odometry_in_world, truth_at
 
 RUNNER = "edge-run, its own clock"
@@ -37,7 +38,7 @@ def headline(data: RunData) -> list[tuple[str, str]]:
         (f"{control['tick_ms']['p99']:.1f} ms", "control tick, p99 (deadline 100 ms)"),
         (f"{reasoning['generations']}", "VLM generations"),
         (f"{_value(delay_s['p50'])} s", "Δt of the action expert, p50"),
-        (f"{moved_under_command_m(data.trace):.2f} m", "walked under command (ground truth)"),
+        (f"{moved_under_command_m(data.trace):.2f} m", "driven under command (ground truth)"),
         (f"{goal_distance_m(data):.2f} m", "from the goal at the end"),
     ]
 
@@ -48,6 +49,16 @@ def odometry_error_m(data: RunData) -> float | None:
     if not len(stamps_ns):
         return None
     return float(np.linalg.norm(odometry[-1, :2] - truth_at(data.trace, stamps_ns[-1:])[0, :2]))
+
+
+def command_latency_ms(data: RunData) -> Record:
+    """Return n, p50, p99 and max of the time from a sent command to its arrival at the robot, ms."""
+    growth = data.settings.get("bridge_growth", (0.0, 0.0, 0.0))
+    found = np.array(command_latencies_ms(data.log.ticks, data.trace.wire, growth))
+    if not len(found):
+        return {"n": 0, "p50": None, "p99": None, "max": None}
+    figures = {"p50": percentile(found, 50), "p99": percentile(found, 99), "max": float(found.max())}
+    return {"n": len(found), **{name: round(value, 3) for name, value in figures.items()}}
 
 
 def numbers(data: RunData, wall_s: float) -> list[Number]:
@@ -114,13 +125,14 @@ def _robot(data: RunData) -> list[Number]:
     error_m = odometry_error_m(data)
     collisions = ", ".join(map(str, hil["collisions"])) or "none"
     return [
-        Number("path walked while commanded", f"{moved_under_command_m(data.trace):.2f} m", TRUTH),
+        Number("path driven while commanded", f"{moved_under_command_m(data.trace):.2f} m", TRUTH),
         Number("distance to the goal at the end", f"{goal_distance_m(data):.2f} m", TRUTH),
         Number("odometry error at the last tick", "no odometry" if error_m is None else f"{error_m:.2f} m", TRUTH),
         Number("touched", collisions, TRUTH),
         Number("fell", "yes" if hil["fell"] else "no", TRUTH),
         Number("velocity commands written by the bridge", f"{bridge['commands']}", "edge-bridge"),
-        Number("Move requests received by the robot", f"{hil['wire']['commands']}", WIRE),
+        Number("motion requests received by the robot", f"{hil['wire']['commands']}", WIRE),
+        Number("command sent until received by the robot, p50 / p99 / max", _latency(data), f"{LOG} and {WIRE}"),
         Number("camera pictures served", f"{hil['video_frames']}", WIRE),
         Number("simulated time per real time", f"{hil['real_time_factor']:.3f}", TRUTH),
     ]
@@ -132,6 +144,13 @@ def _machine(data: RunData, wall_s: float) -> list[Number]:
     if wall_s > 0:
         rows.append(Number("whole demo, wall time", f"{wall_s:.0f} s", "demo"))
     return rows
+
+
+def _latency(data: RunData) -> str:
+    found = command_latency_ms(data)
+    if not found["n"]:
+        return "no command that can be matched"
+    return f"{found['p50']:.1f} / {found['p99']:.1f} / {found['max']:.1f} ms ({found['n']} commands)"
 
 
 def _value(value: float | None, digits: int = 2) -> str:

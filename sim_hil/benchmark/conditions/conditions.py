@@ -14,6 +14,7 @@ from typing import Any
 
 from edge.state.switches import Decoding, RecoverySwitch, SwitchOptions
 from sim_hil.benchmark.conditions.latency import LatencyError, LatencyProfile
+from sim_hil.realtime.robots import GO2, ROBOTS
 from sim_hil.robots.odometry_noise import LEVELS
 
 BASELINES = ("expert", "point-goal", "random", "still")
@@ -90,11 +91,20 @@ class Conditions:
     """Image rendered in every control period: `WxH` px, or `auto` for the policy's own input size (none if unused)."""
     external_timeout_s: float = 60.0
     """Maximum time for an external policy's answer, s."""
+    robot: str | None = None
+    """Robot of the stack that drives in real time (`sim_hil.realtime.robots`); None in lockstep, where each episode
+    has its own."""
 
     def __post_init__(self) -> None:
         _one_of("clock", self.clock, CLOCKS)
         _one_of("drift", self.drift, DRIFTS)
         _one_of("wordings", self.wordings, WORDINGS)
+        if (self.robot is not None) != (self.clock == "realtime"):
+            raise ConditionsError(
+                f"robot: expected one with clock realtime alone, found {self.robot} with {self.clock}"
+            )
+        if self.robot is not None:
+            _one_of("robot", self.robot, tuple(ROBOTS))
         if self.swap_instructions is not None and not 0 <= self.swap_instructions < 2**31:
             raise ConditionsError(f"swapped instructions: expected a seed from 0, found {self.swap_instructions}")
         kind = self.policy.kind
@@ -166,14 +176,17 @@ class Conditions:
             raise ConditionsError(f"conditions: expected the keys {sorted(known)}, found {sorted(content)}")
         try:
             latency = None if content["latency"] is None else LatencyProfile.of_json(content["latency"])
-            return Conditions(**{**content, "policy": PolicySpec.parse(content["policy"]), "latency": latency})
+            before = {"robot": GO2.name} if content["clock"] == "realtime" else {}
+            return Conditions(
+                **{**before, **content, "policy": PolicySpec.parse(content["policy"]), "latency": latency}
+            )
         except (TypeError, AttributeError, LatencyError) as error:
             raise ConditionsError(f"conditions: {error}") from error
 
     def describe(self) -> str:
         """Describe the conditions in one line for reports."""
         parts = [str(self.policy), self.clock]
-        parts += [part for part in (self.mode, self.variant) if part is not None]
+        parts += [part for part in (self.robot, self.mode, self.variant) if part is not None]
         if self.latency is not None:
             parts.append(f"latency {self.latency.name}")
         if self.wordings != "benchmark":

@@ -8,17 +8,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-import firmware_bridge
 from edge.artifacts.files import ArtifactError
 from firmware_bridge.core.config import RobotConfig, load_robot_config
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.policies.baselines import make_baseline
 from sim_hil.benchmark.policies.policy import Policy
+from sim_hil.realtime.robots import GO2
 
 if TYPE_CHECKING:
     from edge.artifacts.manifest import Artifacts
 
-ROBOT_FILE: Final = Path(firmware_bridge.__file__).parent / "robots" / "go2_sim.toml"
+ROBOT_FILE: Final = GO2.file
 """Robot file whose limits apply to both robots, so that a policy is compared under equal limits."""
 BASELINE_CAMERA: Final = (128, 128)
 

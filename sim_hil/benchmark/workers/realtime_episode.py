@@ -29,11 +29,10 @@ from sim_hil.benchmark.env.metrics import FRAME_HZ, is_success, measure
 from sim_hil.benchmark.results.record import EpisodeLog, EpisodeResult
 from sim_hil.benchmark.suite.episode import Episode
 from sim_hil.benchmark.workers.task import EpisodeTask, episode_result
-from sim_hil.realtime.stack import Stack, StackOptions, free_domain
+from sim_hil.realtime.robots import GO2, ROBOTS, StackRobot, free_domain
+from sim_hil.realtime.stack import Stack, StackOptions
 from sim_hil.realtime.truth import TruePose, TruthTail, read_lines
 
-ROBOT: Final = "go2"
-"""The only robot that edge-bridge drives."""
 ARM_TIMEOUT_S: Final = 90.0
 POLL_S: Final = 0.05
 FOLDER: Final = "realtime"
@@ -55,11 +54,11 @@ def check_realtime(conditions: Conditions, *, jobs: int, cluster: bool, video: s
             raise ConditionsError(f"--clock realtime: expected {expected}")
 
 
-def drivable(episodes: Sequence[Episode]) -> tuple[list[Episode], list[str]]:
-    """Return the episodes that can run, and the ids of the skipped ones: edge-bridge drives only the go2."""
+def drivable(episodes: Sequence[Episode], robot: StackRobot) -> tuple[list[Episode], list[str]]:
+    """Return the episodes of this robot's body, and the ids of the others."""
     return (
-        [episode for episode in episodes if episode.robot == ROBOT],
-        [episode.id for episode in episodes if episode.robot != ROBOT],
+        [episode for episode in episodes if episode.robot == robot.hil_robot],
+        [episode.id for episode in episodes if episode.robot != robot.hil_robot],
     )
 
 
@@ -78,8 +77,9 @@ def run_realtime(task: EpisodeTask, on_time: OnTime) -> EpisodeResult:
     """Run one episode. Raises StepError when a process of the stack fails, ConditionsError for another robot."""
     started_ns = time.monotonic_ns()
     episode, conditions = task.episode, task.conditions
-    if episode.robot != ROBOT:
-        raise ConditionsError(f"episode {episode.id}: expected the robot {ROBOT} in real time, found {episode.robot}")
+    robot = ROBOTS[conditions.robot or GO2.name]
+    if episode.robot != robot.hil_robot:
+        raise ConditionsError(f"episode {episode.id}: expected the robot {robot.hil_robot}, found {episode.robot}")
     folder = task.folder / FOLDER / episode.id
     shutil.rmtree(folder, ignore_errors=True)  # left by a previous attempt
     folder.mkdir(parents=True)
@@ -91,6 +91,7 @@ def run_realtime(task: EpisodeTask, on_time: OnTime) -> EpisodeResult:
         people=episode.people,
         seed=episode.seed,
         domain=free_domain(),
+        robot=robot,
         mode=conditions.mode or "async",
         odometry_noise=conditions.drift,
         switches=conditions.switches,

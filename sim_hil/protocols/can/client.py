@@ -6,9 +6,10 @@ import time
 from dataclasses import dataclass
 from typing import Final
 
+from firmware_bridge.can.protection import Verdict
 from sim_hil.protocols.can import frames
 from sim_hil.protocols.can.buses import BusLink
-from sim_hil.protocols.can.frames import COUNTER_PERIOD, Decoder, Encoder, Received, Verdict
+from sim_hil.protocols.can.frames import COUNTER_PERIOD, Decoder, Encoder, Received
 
 COMMAND_S: Final = 0.02
 HEARTBEAT_S: Final = 0.1

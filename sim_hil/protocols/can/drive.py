@@ -17,8 +17,10 @@ from edge.core.cli import (
     command_line,
     write_result,
 )
+from firmware_bridge.can.buses import BusAddress, BusError, open_bus
+from firmware_bridge.core.config_can import INTERFACES
 from sim_hil.protocols.can import frames
-from sim_hil.protocols.can.buses import INTERFACES, BusAddress, BusError, BusLink, open_bus
+from sim_hil.protocols.can.buses import BusLink
 from sim_hil.protocols.can.client import CanClient, Odometry
 
 _ANSWER_S: Final = 3.0

@@ -13,13 +13,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+from firmware_bridge.can.buses import BusAddress, BusError, open_bus
+from firmware_bridge.can.frame import Frame
 from firmware_bridge.client_link import check_is_ours
 from firmware_bridge.core.config import ConfigError, runtime_dir
-from sim_hil.protocols.base import CameraFrontEnd, CommandLog
+from sim_hil.protocols.base import CameraFrontEnd, CommandLog, Vec3
 from sim_hil.protocols.camera_stream import CameraStream
 from sim_hil.protocols.can import frames
-from sim_hil.protocols.can.buses import BusAddress, BusError, BusLink, open_bus
-from sim_hil.protocols.can.frames import Frame, Received
+from sim_hil.protocols.can.buses import BusLink
+from sim_hil.protocols.can.frames import Received
 from sim_hil.protocols.can.node import CanNode
 from sim_hil.protocols.can.pty_line import PtyLine
 from sim_hil.protocols.can.shim import FaultPlan, FaultShim
@@ -84,6 +86,13 @@ def _port(text: str) -> int:
     if not (text.isascii() and text.isdecimal()):
         raise ValueError(f"camera: expected a port of 0..65535, found {text!r}")
     return int(text)
+
+
+def _velocity(received: Received) -> Vec3 | None:
+    """Return the requested velocity: zero for a stop, None for a frame that requests no motion."""
+    if received.name == "VelocityCommand":
+        return received.signals["Vx"], 0.0, received.signals["Wz"]
+    return (0.0, 0.0, 0.0) if (received.name, received.signals["Request"]) in _STOPS else None
 
 
 class CanFrontEnd(CameraFrontEnd):
@@ -172,14 +181,17 @@ class CanFrontEnd(CameraFrontEnd):
         if (received.good or stop) and not self._is_repeated(received):
             self._note(received)
             content = " ".join(f"{key}={received.signals[key]:g}" for key in _TRACED[received.name])
-            self._commands.append(ReceivedCommand(received_ns, "can", frame.identifier, received.name, content))
+            velocity = _velocity(received)
+            self._commands.append(
+                ReceivedCommand(received_ns, "can", frame.identifier, received.name, content, velocity=velocity)
+            )
 
     def _note(self, received: Received) -> None:
         """Count one obeyed frame."""
         self._log.last_command = received.name
         if received.name == "VelocityCommand":
-            self._log.move(received.name, (received.signals["Vx"], 0.0, received.signals["Wz"]))
-        elif (received.name, received.signals["Request"]) in _STOPS:
+            self._log.move(received.name, _velocity(received))
+        elif _velocity(received) is not None:
             self._log.at_zero = True
 
     def _is_repeated(self, received: Received) -> bool:

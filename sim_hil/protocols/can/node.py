@@ -12,9 +12,11 @@ from dataclasses import dataclass
 from typing import Final
 
 from edge.core.geometry import wrap_angle
+from firmware_bridge.can.frame import ERROR_BUS_OFF, ERROR_RESTARTED, Frame
+from firmware_bridge.can.protection import Verdict
 from sim_hil.protocols.base import Base
 from sim_hil.protocols.can import frames
-from sim_hil.protocols.can.frames import Decoder, Encoder, Frame, Received, Verdict
+from sim_hil.protocols.can.frames import Decoder, Encoder, Received
 from sim_hil.robots.carter.sensors import Sensors
 
 COMMAND_TIMEOUT_S: Final = 0.100
@@ -23,9 +25,6 @@ HEARTBEAT_TIMEOUT_S: Final = 0.500
 # Linux with "restart-ms 100".
 BUS_OFF_RECOVERY_S: Final = 0.100
 BATTERY_LOW_PERCENT: Final = 10.0
-# Error classes of the kernel's error frames (linux/can/error.h).
-ERROR_BUS_OFF: Final = 0x040
-ERROR_RESTARTED: Final = 0x100
 _TICK_S: Final = 1e-6  # tolerance for the rounding error of summed steps
 _LEVELS: Final = ("CommandTimeout", "HeartbeatLost", "BatteryLow", "DriveOverload")
 _SIDES: Final = ("Front", "Rear", "Left", "Right")

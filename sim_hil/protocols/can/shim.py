@@ -13,8 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from sim_hil.protocols.can.frames import Frame
-from sim_hil.protocols.can.node import ERROR_BUS_OFF, ERROR_RESTARTED
+from firmware_bridge.can.frame import ERROR_BUS_OFF, ERROR_RESTARTED, Frame
 
 # A frame of 8 bytes with its stuff bits, about 130 bits, on a bus of 500 kbit/s.
 FRAME_S: Final = 130 / 500_000

@@ -1,13 +1,14 @@
 """MAVLink front end of `edge-hil`: the Carter as a rover on UDP, with its camera over HTTP.
 
---link udp:HOST:PORT[,to=HOST:PORT...][,camera=PORT][,system=NUMBER][,key=FILE][,IMPAIRMENT=NUMBER...], for example
+--link udp:HOST:PORT[,to=HOST:PORT...][,camera=PORT][,system=NUMBER][,key=FILE][,autopilot=NAME][,IMPAIRMENT=NUMBER...]
   udp:127.0.0.1:14580,to=127.0.0.1:14540,to=127.0.0.1:14550    the default: heartbeats to the ports of MAVSDK and of
                                                                 ground stations; a station that answers gets all reports
+  udp:127.0.0.1:14580,autopilot=ardupilot    announces ArduPilot Rover instead of PX4: GUIDED and HOLD, its parameters
   udp:127.0.0.1:14580,key=signing.hex    unsigned packets are ignored, all sent packets are signed
   udp:127.0.0.1:14580,loss_percent=30,jitter_ms=200    a radio that loses and delays packets (`udp.Impairment`)
 
-`--faults PATH` accepts the impairment's fields, "button" (emergency stop button pressed) and "mute" (nothing is
-received or sent).
+`--faults PATH` accepts the impairment's fields, "button" (emergency stop button pressed), "pilot" (a person switches
+the remote to MANUAL) and "mute" (nothing is received or sent).
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from sim_hil.protocols.base import CameraFrontEnd, CommandLog
 from sim_hil.protocols.camera_stream import CameraStream
 from sim_hil.protocols.fault_socket import PlanFaults, parse_plan, plan_fields
 from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, ReceivedCommand
+from sim_hil.protocols.mavlink.autopilots import BY_NAME
 from sim_hil.protocols.mavlink.node import COMPONENT, Command, MavlinkNode
 from sim_hil.protocols.mavlink.parameters import Parameters
 from sim_hil.protocols.mavlink.udp import PERFECT, Address, Impairment, UdpLink, parse_address
@@ -33,7 +35,7 @@ from sim_hil.robots.carter.sensors import CarterSensors, Sensors
 from sim_hil.simulation.physics import Simulation
 
 CAMERA_PORT: Final = 8090
-SWITCHES: Final = ("button", "mute")
+SWITCHES: Final = ("button", "mute", "pilot")
 DEFAULT_LINK: Final = "udp:127.0.0.1:14580,to=127.0.0.1:14540,to=127.0.0.1:14550"
 
 _NOT_TRACED: Final = ("mavpackettype", "target_system", "target_component", "time_boot_ms", "command", "confirmation")
@@ -48,6 +50,7 @@ class LinkOptions:
     camera_port: int = CAMERA_PORT
     system: int = 1
     key: bytes | None = None
+    autopilot: str = "px4"
     impairment: Impairment = PERFECT
 
     def __post_init__(self) -> None:
@@ -55,6 +58,8 @@ class LinkOptions:
             raise ValueError(f"camera: expected a port of 0..65535, found {self.camera_port}")
         if not 1 <= self.system <= 254:
             raise ValueError(f"system: expected a number of 1..254, found {self.system}")
+        if self.autopilot not in BY_NAME:
+            raise ValueError(f"autopilot: expected {' or '.join(BY_NAME)}, found {self.autopilot!r}")
 
     @staticmethod
     def parse(text: str | None) -> LinkOptions:
@@ -77,10 +82,14 @@ class LinkOptions:
                     given["system"] = _number(name, value)
                 elif name == "key":
                     given["key"] = read_key(Path(value))
+                elif name == "autopilot":
+                    given["autopilot"] = value
                 elif name in plan_fields(Impairment):
                     faults.append(setting)
                 else:
-                    raise ValueError(f"expected to=, camera=, system=, key= or an impairment, found {setting!r}")
+                    raise ValueError(
+                        f"expected to=, camera=, system=, key=, autopilot= or an impairment, found {setting!r}"
+                    )
             given["impairment"] = parse_plan(Impairment, faults)
             return LinkOptions(parse_address(where.removeprefix("udp:")), tuple(to), **given)
         except (ValueError, OSError) as error:
@@ -102,8 +111,9 @@ class MavlinkFrontEnd(CameraFrontEnd):
         self._reader = Reader(None if link.key is None else Verifier(link.key, ticks))
         self._writer = Writer(link.system, COMPONENT, link.key, ticks)
         self._sensors = CarterSensors(robot, odometry_noise=options.odometry_noise, seed=options.seed)
-        parameters = Parameters(MAV_SYS_ID=link.system)
-        self._node = MavlinkNode(robot, self._read, self._reader.counts, parameters)
+        parameters = Parameters(link.autopilot, MAV_SYS_ID=link.system)
+        autopilot = BY_NAME[link.autopilot]
+        self._node = MavlinkNode(robot, self._read, self._reader.counts, parameters, autopilot)
         self._log = CommandLog()
         self._now_s = 0.0
         self._states = 0
@@ -169,7 +179,9 @@ class MavlinkFrontEnd(CameraFrontEnd):
             for key, value in message.to_dict().items()
             if key not in _NOT_TRACED and value and value == value  # MAVSDK fills unused fields with NaN
         )
-        return [ReceivedCommand(received_ns, "mavlink", number, name, f"station={station.system} {content}")]
+        velocity = (0.0, 0.0, 0.0) if wanted is None else (wanted[0], 0.0, wanted[1]) if moves else None
+        text = f"station={station.system} {content}"
+        return [ReceivedCommand(received_ns, "mavlink", number, name, text, velocity=velocity, source=station.system)]
 
     def publish(self, step: int, stamp_s: float) -> None:
         """Advance the rover's clock and send the messages that are due."""
@@ -177,6 +189,7 @@ class MavlinkFrontEnd(CameraFrontEnd):
         if self._faults is not None:
             self._faults.poll()
             self._node.vehicle.button = "button" in self._faults.active
+            self._node.vehicle.pilot = "pilot" in self._faults.active
             self._link.impairment = self._faults.plan
         self._node.step(stamp_s)
         self._flush(self._node.due(stamp_s))

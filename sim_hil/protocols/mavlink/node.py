@@ -15,6 +15,7 @@ from pymavlink.dialects.v20 import common
 
 from sim_hil.protocols.base import Base
 from sim_hil.protocols.mavlink import parameters, telemetry
+from sim_hil.protocols.mavlink.autopilots import PX4, Autopilot
 from sim_hil.protocols.mavlink.parameters import Parameters
 from sim_hil.protocols.mavlink.setpoints import SetpointError, Sticks, manual_sticks, override_sticks, read_setpoint
 from sim_hil.protocols.mavlink.vehicle import (
@@ -23,8 +24,6 @@ from sim_hil.protocols.mavlink.vehicle import (
     Health,
     Station,
     Vehicle,
-    custom_mode_of,
-    find_mode,
 )
 from sim_hil.protocols.mavlink.wire import Counts, Message
 from sim_hil.robots.carter.sensors import Sensors
@@ -65,12 +64,19 @@ class MavlinkNode:
     """Component of one rover: call `receive` for every message, then `step` and `due` after every physics step."""
 
     def __init__(
-        self, base: Base, read: Callable[[], Sensors], counts: Counts, parameter_values: Parameters | None = None
+        self,
+        base: Base,
+        read: Callable[[], Sensors],
+        counts: Counts,
+        parameter_values: Parameters | None = None,
+        autopilot: Autopilot = PX4,
     ) -> None:
         """Create the component; `read` returns the current sensor reading, `counts` are the packet reader's."""
-        self.parameters = parameter_values or Parameters()
-        self.vehicle = Vehicle(base, self.parameters)
-        self.schedule = telemetry.Schedule()
+        self.autopilot = autopilot
+        self.parameters = parameter_values or Parameters(autopilot.name)
+        self.vehicle = Vehicle(base, self.parameters, stays=autopilot.stays)
+        silent = () if autopilot.has_odometry else (common.MAVLINK_MSG_ID_ODOMETRY,)
+        self.schedule = telemetry.Schedule(silent)
         self.counts = counts
         self._read = read
         self._tilt = telemetry.TiltFilter()
@@ -105,6 +111,7 @@ class MavlinkNode:
             self.vehicle,
             self.counts.malformed,
             self.parameters["BAT_LOW_THR"],
+            self.autopilot,
         )
 
     def receive(self, message: Message, station: Station, now_s: float) -> bool:
@@ -189,7 +196,7 @@ class MavlinkNode:
     def _set_mode(self, message: Message, station: Station, now_s: float) -> bool:
         mode = None
         if message.base_mode & common.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
-            mode = custom_mode_of(message.custom_mode)
+            mode = self.autopilot.mode_of(message.custom_mode)
         self.vehicle.set_mode(station, mode, now_s)
         return True
 
@@ -204,22 +211,22 @@ class MavlinkNode:
         return self.vehicle.sticks(station, sticks, now_s)
 
     def _parameter_list(self, message: Message, station: Station, now_s: float) -> bool:
-        self._wait(parameters.NAMES)
+        self._wait(self.parameters.names)
         return False
 
     def _parameter_read(self, message: Message, station: Station, now_s: float) -> bool:
         index = message.param_index
-        if index == -1 and message.param_id in parameters.TABLE:
+        if index == -1 and message.param_id in self.parameters.table:
             self._wait((message.param_id,))
-        elif 0 <= index < len(parameters.NAMES):
-            self._wait((parameters.NAMES[index],))
+        elif 0 <= index < len(self.parameters.names):
+            self._wait((self.parameters.names[index],))
         return False
 
     def _parameter_set(self, message: Message, station: Station, now_s: float) -> bool:
         name: str | None = message.param_id
         if self.vehicle.may_change(station, now_s):
             name = self.parameters.set(message)
-        if name in parameters.TABLE:
+        if name in self.parameters.table:
             self._wait((str(name),))
         return False
 
@@ -297,7 +304,7 @@ def _set_mode(node: MavlinkNode, station: Station, command: Command, now_s: floa
     base, main, sub = command.params[:3]
     if not all(map(isfinite, (base, main, sub))) or not int(base) & common.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
         return node.vehicle.set_mode(station, None, now_s)
-    return node.vehicle.set_mode(station, find_mode(int(main), int(sub)), now_s)
+    return node.vehicle.set_mode(station, node.autopilot.find(int(main), int(sub)), now_s)
 
 
 def _set_interval(node: MavlinkNode, station: Station, command: Command, now_s: float) -> int:

@@ -15,6 +15,7 @@ from typing import Final
 from pymavlink.dialects.v20 import common
 
 from edge.core.geometry import wrap_angle
+from sim_hil.protocols.mavlink.autopilots import PX4, Autopilot
 from sim_hil.protocols.mavlink.setpoints import heading_degrees
 from sim_hil.protocols.mavlink.vehicle import Vehicle
 from sim_hil.protocols.mavlink.wire import Message
@@ -51,6 +52,7 @@ class Snapshot:
     vehicle: Vehicle
     broken: int
     low_charge: float  # 0 to 1
+    autopilot: Autopilot = PX4
 
     @property
     def boot_ms(self) -> int:
@@ -105,20 +107,20 @@ class Snapshot:
         )
 
 
-def heartbeat(vehicle: Vehicle) -> Message:
-    """Return the heartbeat; it announces PX4, because clients know PX4's modes."""
+def heartbeat(vehicle: Vehicle, autopilot: Autopilot = PX4) -> Message:
+    """Return the heartbeat; it announces an autopilot whose modes clients know."""
     base_mode = vehicle.mode.base_flags | (common.MAV_MODE_FLAG_SAFETY_ARMED if vehicle.armed else 0)
     if vehicle.estop:
         status = common.MAV_STATE_EMERGENCY
     else:
         status = common.MAV_STATE_ACTIVE if vehicle.armed else common.MAV_STATE_STANDBY
     return common.MAVLink_heartbeat_message(
-        common.MAV_TYPE_GROUND_ROVER, common.MAV_AUTOPILOT_PX4, base_mode, vehicle.mode.custom_mode, status, 3
+        common.MAV_TYPE_GROUND_ROVER, autopilot.number, base_mode, autopilot.custom_mode(vehicle.mode), status, 3
     )
 
 
 def _heartbeat(now: Snapshot) -> Message:
-    return heartbeat(now.vehicle)
+    return heartbeat(now.vehicle, now.autopilot)
 
 
 def _sys_status(now: Snapshot) -> Message:
@@ -288,8 +290,11 @@ class TiltFilter:
 class Schedule:
     """Schedule of the periodic messages."""
 
-    def __init__(self) -> None:
-        self._periods_s = {number: 1 / stream.rate_hz for number, stream in STREAMS.items() if stream.rate_hz}
+    def __init__(self, without: tuple[int, ...] = ()) -> None:
+        """`without`: numbers of messages that this rover does not have."""
+        self._without = without
+        usual = {number: stream for number, stream in STREAMS.items() if number not in without}
+        self._periods_s = {number: 1 / stream.rate_hz for number, stream in usual.items() if stream.rate_hz}
         self._next_s = dict.fromkeys(self._periods_s, 0.0)
 
     def interval_us(self, number: int) -> int | None:
@@ -304,7 +309,8 @@ class Schedule:
 
         Returns False for an unknown message, a bad interval and the heartbeat, whose rate is fixed.
         """
-        if number not in STREAMS or number == common.MAVLINK_MSG_ID_HEARTBEAT or not -1 <= interval_us < 1e9:
+        known = number in STREAMS and number not in self._without
+        if not known or number == common.MAVLINK_MSG_ID_HEARTBEAT or not -1 <= interval_us < 1e9:
             return False
         usual = STREAMS[number].rate_hz
         self._periods_s.pop(number, None)

@@ -97,13 +97,18 @@ class Health:
 class Vehicle:
     """State machine of one rover; call `step` after every physics step."""
 
-    def __init__(self, base: Base, parameters: Parameters) -> None:
+    def __init__(self, base: Base, parameters: Parameters, *, stays: bool = False) -> None:
+        """`stays`: without setpoints it stops but stays in OFFBOARD, as ArduPilot does in its mode GUIDED."""
         self._base = base
+        self._stays = stays
         self._parameters = parameters
         self.armed = False
         self.mode = Mode.HOLD
         self.estop = False
         self.button = False
+        self.pilot = False
+        """A person has switched the remote to MANUAL."""
+        self._had_pilot = False
         self.health = Health()
         self.controller: Station | None = None
         self.refused_setpoints = 0
@@ -224,7 +229,7 @@ class Vehicle:
             return self._refuse("Mode denied: another station is in control", REJECTED)
         if mode is None:
             return self._refuse("Mode denied: expected MANUAL, HOLD or OFFBOARD", DENIED)
-        if mode is Mode.OFFBOARD and not self._fresh(self._setpoint_s, now_s):
+        if mode is Mode.OFFBOARD and not self._stays and not self._fresh(self._setpoint_s, now_s):
             return self._refuse("Offboard denied: no setpoints", REJECTED)
         if mode is not self.mode:
             if mode is Mode.OFFBOARD:
@@ -262,13 +267,27 @@ class Vehicle:
             self.emergency_stop("button")
         if self.armed:
             self._watch_station(now_s)
+        if self.pilot and not self._had_pilot:
+            self._base.command(*_STOP)
+            self._leave()
+            self.mode = Mode.MANUAL
+            self.send_text(_SEVERITY_NEWS, "Mode MANUAL by the remote")
+        self._had_pilot = self.pilot
         if self.armed and self.mode is Mode.OFFBOARD and not self._fresh(self._setpoint_s, now_s):
-            self._hold("Failsafe: no setpoints, holding")
+            self._lose_setpoints()
         if self.armed and self._sticks is not None and not self._fresh(self._sticks_s, now_s):
             self._sticks = None
             if self.mode is Mode.MANUAL:
                 self._hold("Failsafe: no sticks, holding")
         self._drive(now_s)
+
+    def _lose_setpoints(self) -> None:
+        if not self._stays:
+            self._hold("Failsafe: no setpoints, holding")
+        elif self._setpoint is not None:
+            self._setpoint = None
+            self._base.command(*_STOP)
+            self.send_text(_SEVERITY_REFUSED, "target not received last 3secs, stopping")
 
     def _watch_station(self, now_s: float) -> None:
         silent_s = now_s - self._controller_s

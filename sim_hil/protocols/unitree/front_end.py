@@ -19,7 +19,7 @@ from sim_hil.protocols.unitree.services.behaviour import Go2Behaviour
 from sim_hil.protocols.unitree.services.idl_command import LowCmd_
 from sim_hil.protocols.unitree.services.low_level import LOW_COMMAND_TOPIC
 from sim_hil.protocols.unitree.services.service import Answer, Lease, LeaseServer, Received, ServiceServer
-from sim_hil.protocols.unitree.services.sport import UNLEASED, RequestLog, SportService, api_name
+from sim_hil.protocols.unitree.services.sport import UNLEASED, RequestLog, SportService, api_name, requested_velocity
 from sim_hil.protocols.unitree.services.switching import VUI_SERVICE, MotionSwitcher, RobotState, Vui
 from sim_hil.protocols.unitree.state import Remote, StatePublishers
 from sim_hil.robots.go2.body import Go2, RobotTruth
@@ -146,6 +146,7 @@ class UnitreeFrontEnd(CameraFrontEnd):
                 api_name(one.service, one.api_id),
                 one.parameter,
                 one.request_id,
+                requested_velocity(one),
             )
             for one in received
         ]

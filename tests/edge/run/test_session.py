@@ -127,6 +127,9 @@ class Rig:
             def ready(self) -> bool:
                 return rig.now_ns >= rig.ready_s * 1e9
 
+            def why_missing(self, _status: object) -> str:
+                return " (CAN interface can0 is down)"
+
             def close(self) -> None:
                 pass
 
@@ -182,7 +185,9 @@ def test_a_robot_that_boots_in_five_minutes_is_waited_for_where_an_operator_arms
 
 def test_without_an_operator_it_is_a_refusal_after_ten_seconds(rig: Rig) -> None:
     rig.ready_s = 300.0
-    with pytest.raises(RefusedError, match="no state from the robot in 10 s"):
+    with pytest.raises(
+        RefusedError, match=r"no state from the robot in 10 s on .* \(CAN interface can0 is down\): is it on"
+    ):
         rig.run()
 
 

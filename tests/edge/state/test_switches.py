@@ -13,7 +13,7 @@ from edge.run import command as runner
 from edge.state.ring import EncodedFrame
 from edge.state.switches import Decoding, RecoverySwitch, Switches, SwitchOptions
 from firmware_bridge.core.config import ConfigError
-from sim_hil.realtime.stack import ROBOT_FILE
+from sim_hil.realtime.robots import GO2
 from tests.support.runner.control_bench import Bench
 
 CONSTRAINED, ON, OFF = Decoding.CONSTRAINED, RecoverySwitch.ON, RecoverySwitch.OFF
@@ -21,7 +21,7 @@ CONSTRAINED, ON, OFF = Decoding.CONSTRAINED, RecoverySwitch.ON, RecoverySwitch.O
 
 def asked(*arguments: str) -> SwitchOptions:
     """Switches that the runner's command line asks for."""
-    command = ["--artifacts", "a", "--robot", str(ROBOT_FILE), "--instruction", "stop at the desk", *arguments]
+    command = ["--artifacts", "a", "--robot", str(GO2.file), "--instruction", "stop at the desk", *arguments]
     return runner.read_options(runner.parser().parse_args(command))[1].switches
 
 

@@ -93,7 +93,7 @@ def test_a_soak_without_measurements_is_undecided_with_exit_code_1(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     options = SoakOptions(
-        tmp_path, "0" * 64, True, ("hospital",), 0, 0, 60.0, 60.0, 0.8, None, "async", "0", "none", 0, "default"
+        tmp_path, "0" * 64, True, ("hospital",), 0, 0, 60.0, 60.0, 0.8, None, "async", "0", "none", 0, "go2", "default"
     )
     soak = SoakFolder.create(tmp_path / "out", options)
     result = soak_result(soak, options, load_budget(DEFAULT_BUDGET), finished=True)

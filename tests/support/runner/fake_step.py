@@ -12,6 +12,11 @@ import sys
 import time
 from pathlib import Path
 
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[3]))  # so that this script finds its neighbour
 
 DURATION_S = 6.0
@@ -47,7 +52,7 @@ def hil(mood: str) -> None:
     Path(value("--trace")).write_text("".join(json.dumps(line) + "\n" for line in lines))
     if mood == "slow":
         time.sleep(60)
-    sys.stderr.write(f"edge-hil: ready, domain {value('--domain')} on lo\n")
+    sys.stderr.write(f"edge-hil: ready, {[each for each in sys.argv if 'domain' in each]}\n")
     sys.stderr.flush()
     if mood == "early":
         time.sleep(0.4)
@@ -59,7 +64,7 @@ def hil(mood: str) -> None:
 def bridge(mood: str) -> None:
     from tests.support.runner import synthetic_run
 
-    Path(value("--socket")).touch()
+    Path(tomllib.loads(Path(value("--robot")).read_text())["bridge"]["socket"]).touch()
     wait_for_interrupt(mood)
     Path(value("--json")).write_text(json.dumps(synthetic_run.bridge_result(DURATION_S)))
 

@@ -91,7 +91,11 @@ def trace_lines(duration_s: float) -> list[dict[str, Any]]:
 def wire(t_ns: int, name: str, parameter: dict[str, float] | str) -> dict[str, Any]:
     """One request as the robot's side saw it."""
     text = json.dumps(parameter) if isinstance(parameter, dict) else parameter
-    return {"t_ns": t_ns, "kind": "wire", "service": "sport", "api_id": 1008, "name": name, "parameter": text}
+    velocity = [0.0, 0.0, 0.0] if name == "StopMove" else None
+    if isinstance(parameter, dict):
+        velocity = [parameter[axis] for axis in "xyz"]
+    request = {"service": "sport", "api_id": 1008, "name": name, "parameter": text, "velocity": velocity}
+    return {"t_ns": t_ns, "kind": "wire", **request}
 
 
 def hil_result(duration_s: float) -> dict[str, Any]:

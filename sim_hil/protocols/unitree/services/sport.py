@@ -91,6 +91,15 @@ def handle_sport(robot: Robot, api_id: int, parameter: str) -> Answer:
     return (robot.sport(action), "") if action is not None else (ids.ERROR_NOT_IMPLEMENTED, "")
 
 
+def requested_velocity(request: Received) -> tuple[float, float, float] | None:
+    """Return a sport request's velocity (m/s, m/s, rad/s): zero for one that ends motion, None for any other."""
+    if request.service != ids.SPORT_SERVICE:
+        return None
+    if request.api_id == ids.MOVE:
+        return parse_move(request.parameter)
+    return (0.0, 0.0, 0.0) if request.api_id in _ENDS_MOTION else None
+
+
 class RequestLog(CommandLog):
     """Summary of the commands received over sport and obstacles_avoid."""
 

@@ -16,8 +16,11 @@ from can.interfaces.udp_multicast.utils import pack_message
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_hil.protocols.can.buses import BusAddress, BusError, BusLink, SerialFrames, open_bus, unpacked
-from sim_hil.protocols.can.frames import Frame
+from firmware_bridge.can.buses import BusAddress, BusError, open_bus
+from firmware_bridge.can.frame import Frame
+from firmware_bridge.can.multicast import unpacked
+from firmware_bridge.can.serial_line import SerialFrames
+from sim_hil.protocols.can.buses import BusLink
 from sim_hil.protocols.can.pty_line import PtyLine
 
 FRAME = Frame(0x123, b"\x01\xaa\xbb\x04")
@@ -175,8 +178,9 @@ _MULTICAST = """
 import socket, time
 import can
 from can.interfaces.udp_multicast.utils import pack_message
-from sim_hil.protocols.can.buses import BusAddress, BusLink, open_bus
-from sim_hil.protocols.can.frames import Frame
+from firmware_bridge.can.buses import BusAddress, open_bus
+from sim_hil.protocols.can.buses import BusLink
+from firmware_bridge.can.frame import Frame
 GROUP = "239.74.163.2"
 a, b = (BusLink(open_bus(BusAddress("udp_multicast", GROUP))) for _ in range(2))
 def arrives(wanted, send):

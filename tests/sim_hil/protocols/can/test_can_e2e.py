@@ -8,19 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from firmware_bridge.can.frame import Frame
+from firmware_bridge.can.protection import Checker, Verdict
 from sim_hil.protocols.can import frames
-from sim_hil.protocols.can.frames import (
-    COUNTER_PERIOD,
-    MAX_AHEAD,
-    Checker,
-    Decoder,
-    Encoder,
-    Frame,
-    Verdict,
-    crc8_j1850,
-    frame_crc,
-    protect,
-)
+from sim_hil.protocols.can.frames import COUNTER_PERIOD, MAX_AHEAD, PROTECTION, Decoder, Encoder
 
 MESSAGES = frames.database().messages
 names = st.sampled_from([message.name for message in MESSAGES])
@@ -41,11 +32,35 @@ def messages_with_values(draw: st.DrawFn) -> tuple[str, dict[str, float]]:
 
 def velocity(counter: int, vx: int = 500) -> Frame:
     """A VelocityCommand as its sender makes it."""
-    return Frame(272, protect(272, bytes((0, 0)) + vx.to_bytes(2, "little", signed=True) + bytes(2), counter))
+    data = bytes((0, 0)) + vx.to_bytes(2, "little", signed=True) + bytes(2)
+    return Frame(272, PROTECTION.protect(272, data, counter))
 
 
 def test_the_crc_of_the_standard_text_is_the_published_one() -> None:
-    assert crc8_j1850(b"123456789") == 0x4B
+    assert PROTECTION.crc.of(b"123456789") == 0x4B
+
+
+def plain_crc(data: bytes) -> int:
+    """CRC-8 SAE J1850, bit by bit: an independent computation."""
+    crc = 0xFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = (crc << 1 ^ 0x1D) & 0xFF if crc & 0x80 else crc << 1
+    return crc ^ 0xFF
+
+
+@given(st.integers(0, 0x7FF), st.binary(min_size=2, max_size=8), st.integers(0, COUNTER_PERIOD - 1))
+def test_protected_frames_have_the_crc_that_the_dbc_file_describes(identifier: int, data: bytes, counter: int) -> None:
+    found = PROTECTION.protect(identifier, data, counter)
+    assert found[1] & 0x0F == counter and found[1] & 0xF0 == data[1] & 0xF0 and found[2:] == data[2:]
+    assert found[0] == plain_crc(bytes((identifier & 0xFF, identifier >> 8)) + found[1:])
+
+
+def test_a_velocity_command_has_these_bytes_on_the_bus() -> None:
+    # 0.5 m/s is 500 mm/s, 0x01F4, lowest byte first; -0.25 rad/s is -250, 0xFF06. The CRC was computed bit by bit.
+    frame = Encoder().encode("VelocityCommand", Vx=0.5, Wz=-0.25)
+    assert frame == Frame(0x110, bytes.fromhex("8b00f40106ff"))
 
 
 @given(messages_with_values())
@@ -69,25 +84,25 @@ def test_up_to_three_flipped_bits_never_pass(
     data = bytearray(frame.data)
     for bit in {bit % (8 * len(data)) for bit in bits}:
         data[bit // 8] ^= 1 << bit % 8
-    checker = Checker(len(data))
+    checker = Checker(len(data), PROTECTION)
     assert checker.check(Frame(frame.identifier, bytes(data))) is Verdict.WRONG_CRC
 
 
 @given(names, names)
 def test_a_frame_under_another_identifier_is_wrong(name: str, other: str) -> None:
-    data = protect(frames.database().get_message_by_name(name).frame_id, bytes(8), 3)
+    data = PROTECTION.protect(frames.database().get_message_by_name(name).frame_id, bytes(8), 3)
     identifier = frames.database().get_message_by_name(other).frame_id
-    assert (Checker(8).check(Frame(identifier, data)) is Verdict.WRONG_CRC) == (name != other)
+    assert (Checker(8, PROTECTION).check(Frame(identifier, data)) is Verdict.WRONG_CRC) == (name != other)
 
 
 def test_a_frame_of_another_length_is_wrong() -> None:
     data = bytes((0, 5, 1, 2, 3))
-    data = bytes((frame_crc(272, data),)) + data[1:]
-    assert Checker(6).check(Frame(272, data)) is Verdict.WRONG_LENGTH
+    data = bytes((PROTECTION.crc_of(272, data),)) + data[1:]
+    assert Checker(6, PROTECTION).check(Frame(272, data)) is Verdict.WRONG_LENGTH
 
 
 def test_a_repeated_frame_is_distinguished_from_a_new_one() -> None:
-    checker = Checker(6)
+    checker = Checker(6, PROTECTION)
     assert [checker.check(velocity(n)) for n in (0, 1, 1, 1, 2)] == [
         Verdict.FIRST, Verdict.GOOD, Verdict.REPEATED, Verdict.REPEATED, Verdict.GOOD,
     ]  # fmt: skip
@@ -95,7 +110,7 @@ def test_a_repeated_frame_is_distinguished_from_a_new_one() -> None:
 
 @given(st.integers(0, COUNTER_PERIOD - 1), st.integers(0, MAX_AHEAD - 1))
 def test_lost_frames_are_counted_by_the_gap_in_the_counter(start: int, lost: int) -> None:
-    checker = Checker(6)
+    checker = Checker(6, PROTECTION)
     checker.check(velocity(start))
     checker.check(velocity((start + 1) % COUNTER_PERIOD))
     assert checker.check(velocity((start + 2 + lost) % COUNTER_PERIOD)) is Verdict.GOOD
@@ -104,7 +119,7 @@ def test_lost_frames_are_counted_by_the_gap_in_the_counter(start: int, lost: int
 
 @given(st.integers(0, COUNTER_PERIOD - 1), st.integers(1, COUNTER_PERIOD - MAX_AHEAD - 1))
 def test_a_late_old_frame_is_not_obeyed_and_the_stream_continues(start: int, back: int) -> None:
-    checker = Checker(6)
+    checker = Checker(6, PROTECTION)
     for step in range(3):
         checker.check(velocity((start + step) % COUNTER_PERIOD))
     assert checker.check(velocity((start + 2 - back) % COUNTER_PERIOD)) is Verdict.OUT_OF_ORDER

@@ -13,10 +13,11 @@ from pathlib import Path
 
 import pytest
 
+from firmware_bridge.can.buses import BusAddress, open_bus
+from firmware_bridge.can.frame import Frame
 from sim_hil.protocols.can import frames
-from sim_hil.protocols.can.buses import BusAddress, BusLink, open_bus
+from sim_hil.protocols.can.buses import BusLink
 from sim_hil.protocols.can.client import CanClient
-from sim_hil.protocols.can.frames import Frame
 from sim_hil.protocols.can.front_end import LinkOptions, open_front_end
 from sim_hil.protocols.front_end import FrontEndError
 from sim_hil.simulation.physics import Simulation

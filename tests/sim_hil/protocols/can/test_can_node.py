@@ -7,9 +7,11 @@ from dataclasses import replace
 import pytest
 
 from edge.core.geometry import SE2
+from firmware_bridge.can.frame import ERROR_BUS_OFF, ERROR_RESTARTED, Frame
+from firmware_bridge.can.protection import Verdict
 from sim_hil.protocols.can import frames
-from sim_hil.protocols.can.frames import Decoder, Encoder, Frame, Received, Verdict
-from sim_hil.protocols.can.node import BUS_OFF_RECOVERY_S, ERROR_BUS_OFF, ERROR_RESTARTED, CanNode
+from sim_hil.protocols.can.frames import Decoder, Encoder, Received
+from sim_hil.protocols.can.node import BUS_OFF_RECOVERY_S, CanNode
 from sim_hil.robots.carter.sensors import Sensors
 from tests.support.robot.fake_base import FakeBase
 

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim_hil.protocols.can.frames import Decoder, Encoder, Frame
-from sim_hil.protocols.can.node import ERROR_BUS_OFF, ERROR_RESTARTED
+from firmware_bridge.can.frame import ERROR_BUS_OFF, ERROR_RESTARTED, Frame
+from sim_hil.protocols.can.frames import Decoder, Encoder
 from sim_hil.protocols.can.shim import BABBLER_ID, FRAME_S, FaultPlan, FaultShim
 from sim_hil.protocols.fault_socket import parse_plan
 

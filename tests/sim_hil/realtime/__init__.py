@@ -1,0 +1,1 @@
+"""Tests of sim_hil/realtime."""
