@@ -149,7 +149,7 @@ BRIDGE: tuple[Fault, ...] = (
     Fault(
         "robot-link-down", 46, Action.STOP, 100, "bridge",
         "Commands cannot be sent: the network to the robot is down or its queue is full.",
-        "Check the network interface in the robot file.",
+        "Check the interface or device that the robot file names; edge-doctor says what is missing.",
         "tests/firmware_bridge/test_bridge_dangers.py::TestEveryDanger::test_it_stops_a_driven_robot_in_the_same_step",
     ),
     Fault(
@@ -217,8 +217,8 @@ START: tuple[Fault, ...] = (
     ),
     Fault(
         "interface-absent", 46, Action.STOP, 0, "start",
-        "The robot's network interface is absent or has no address: the bridge waits, and keeps an emergency stop.",
-        "Plug in the robot's cable, or correct dds.interface in the robot file.",
+        "The interface or device of the robot's link is absent: the bridge waits, and keeps an emergency stop.",
+        "Plug in the robot's cable or adapter, or correct its name in the robot file.",
         "tests/firmware_bridge/test_bridge_late_interface.py::TestProcess::test_it_serves_once_the_interface_appears",
     ),
     Fault(
@@ -226,6 +226,12 @@ START: tuple[Fault, ...] = (
         "The robot file is for another robot or protocol.",
         "Name the file of the robot that is connected.",
         "tests/firmware_bridge/test_bridge_dangers.py::TestIdentity::test_another_robot_is_refused_before_anything_moves",
+    ),
+    Fault(
+        "unsafe-robot", 58, Action.STOP, 0, "start",
+        "The robot's own protection, such as a failsafe parameter, is weaker than the robot file requires.",
+        "Correct on the robot what edge-bridge status names, then restart the bridge.",
+        "tests/edge/run/test_operator_arm.py::TestBridge::test_a_robot_whose_own_protection_is_weak_is_not_armed",
     ),
     Fault(
         "restart-storm", 59, Action.STOP, 0, "start",
@@ -256,6 +262,7 @@ FAULT_OF_CAUSE: Mapping[str, str] = MappingProxyType(
         "tipped": "tipped-over",
         "robot_moving": "bridge-killed",
         "wrong_robot": "wrong-robot",
+        "unsafe_robot": "unsafe-robot",
     }
 )
 """Fault of each cause of a bridge's stop (firmware_bridge.core.link.CAUSES)."""

@@ -83,10 +83,12 @@ class TestBridge:
 
     def test_an_arming_that_is_refused_has_used_it_up(self) -> None:
         bench = permitted()
-        bench.step(battery_percent=3)
+        bench.battery = 3
+        bench.step()
         bench.ask_to_arm()
         assert bench.status.cause == "battery_low"
-        bench.step(battery_percent=90)
+        bench.battery = 90
+        bench.step()
         assert refused(bench)
 
     def test_an_operators_stop_takes_it_back(self) -> None:
@@ -112,9 +114,20 @@ class TestBridge:
         bench.step()
         assert (bench.status.cause, bench.status.blocked_by) == ("robot_moving", "operator")
 
+    def test_a_robot_whose_own_protection_is_weak_is_not_armed(self) -> None:
+        bench = Bench()
+        weak = "FS_ACTION is 0, expected 2"
+        bench.step(Arm(), unsafe=weak)
+        for _ in range(100):
+            bench.now_ns += 20 * MS
+            bench.step(unsafe=weak)
+        assert (bench.status.state, bench.status.blocked_by) == ("disarmed", "unsafe_robot")
+        assert weak in bench.status.reason and bench.written == []
+
     def test_other_obstacles_to_arming_are_named_first(self) -> None:
         bench = bench_of()
-        bench.step(battery_percent=3)
+        bench.battery = 3
+        bench.step()
         assert bench.status.blocked_by == "battery_low"
 
 
@@ -243,7 +256,8 @@ class TestRunner:
     def test_every_other_refusal_is_reported_within_half_a_second(self) -> None:
         """Also one that comes between two looks at the status."""
         runner = Runner(Bench())
-        runner.bench.step(battery_percent=3)
+        runner.bench.battery = 3
+        runner.bench.step()
         with pytest.raises(RefusedError, match="the battery has 3 %"):
             runner.run()
         assert runner.now_ms <= 500

@@ -31,7 +31,9 @@ MS = 1_000_000
 def robot_with(folder: Path, source: str) -> RobotConfig:
     go2 = load_robot_config(GO2_SIM, socket=folder / "bridge.sock")
     camera = replace(go2.camera, source=source)
-    return replace(go2, protocol="ros2", ros2=Ros2Config(), camera=camera, mount=None)
+    return replace(
+        go2, protocol="ros2", ros2=Ros2Config(base_timeout_ms=500, battery="battery"), camera=camera, mount=None
+    )
 
 
 def until(done: Callable[[], object], meanwhile: Callable[[], object] = lambda: None) -> None:
