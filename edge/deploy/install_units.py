@@ -144,7 +144,7 @@ def run(args: argparse.Namespace, say: Callable[[str], None], host: Host | None 
         say(f"{path}: the services cannot read it unless it is theirs: chmod o+rX {shlex.quote(str(path))}")
     if (secret := inputs.link.secret) is not None:
         key, user = shlex.quote(str(secret)), inputs.users.bridge
-        say(f"{secret}: only the bridge may read it: sudo chown {user}: {key} && sudo chmod 0400 {key}")
+        say(f"{secret}: only the bridge may read it: sudo chown {user}: {key} && sudo chmod 0600 {key}")
     _report_firewall(inputs, say)
     contents = _contents(args, inputs, host)
     written = _write(contents, force=args.force)

@@ -60,11 +60,11 @@ class FloorProjector:
         self.focal_px = width_px / 2 / math.tan(geometry.hfov_rad / 2)
         self._cx = (width_px - 1) / 2
         self._cy = (height_px - 1) / 2
-        self._geometry = geometry
+        self.geometry = geometry
 
     def camera_height_m(self, attitude: Attitude) -> float:
         """Height of the camera above the floor, m; a nose-down pitch lowers it."""
-        return self._geometry.height_m + attitude.lift_m - self._geometry.forward_m * math.sin(attitude.pitch_rad)
+        return self.geometry.height_m + attitude.lift_m - self.geometry.forward_m * math.sin(attitude.pitch_rad)
 
     def floor_points(self, pixels: Array, attitude: Attitude) -> tuple[Array, Array]:
         """Project pixels [n, 2] to floor points in the level base frame [n, 2], m, and depression below level [n], rad.
@@ -76,18 +76,18 @@ class FloorProjector:
         depression = np.arctan2(-rays[:, 2], horizontal)
         drop = np.maximum(-rays[:, 2], 1e-6)
         points = rays[:, :2] * (self.camera_height_m(attitude) / drop)[:, None]
-        points[:, 0] += self._geometry.forward_m * math.cos(attitude.pitch_rad)
+        points[:, 0] += self.geometry.forward_m * math.cos(attitude.pitch_rad)
         return points, depression
 
     def pixels(self, points: Array, attitude: Attitude) -> Array:
         """Project floor points [..., 2] in the level base frame to pixels [..., 2]; points behind give a far pixel."""
-        x = points[..., 0] - self._geometry.forward_m * math.cos(attitude.pitch_rad)
+        x = points[..., 0] - self.geometry.forward_m * math.cos(attitude.pitch_rad)
         y, z = points[..., 1], -self.camera_height_m(attitude)
         cp, sp = math.cos(attitude.pitch_rad), math.sin(attitude.pitch_rad)
         cr, sr = math.cos(attitude.roll_rad), math.sin(attitude.roll_rad)
         bx, level_z = cp * x - sp * z, sp * x + cp * z
         by, bz = cr * y + sr * level_z, -sr * y + cr * level_z
-        cc, sc = math.cos(self._geometry.pitch_rad), math.sin(self._geometry.pitch_rad)
+        cc, sc = math.cos(self.geometry.pitch_rad), math.sin(self.geometry.pitch_rad)
         forward, up = cc * bx - sc * bz, sc * bx + cc * bz
         forward = np.maximum(forward, 1e-3)
         return np.stack((self._cx - self.focal_px * by / forward, self._cy - self.focal_px * up / forward), axis=-1)
@@ -95,7 +95,7 @@ class FloorProjector:
     def _level_rays(self, pixels: Array, attitude: Attitude) -> Array:
         left = (self._cx - pixels[:, 0]) / self.focal_px
         up = (self._cy - pixels[:, 1]) / self.focal_px
-        cc, sc = math.cos(self._geometry.pitch_rad), math.sin(self._geometry.pitch_rad)
+        cc, sc = math.cos(self.geometry.pitch_rad), math.sin(self.geometry.pitch_rad)
         bx, bz = cc + sc * up, cc * up - sc
         cr, sr = math.cos(attitude.roll_rad), math.sin(attitude.roll_rad)
         y, z = cr * left - sr * bz, sr * left + cr * bz

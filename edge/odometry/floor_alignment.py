@@ -35,8 +35,9 @@ POINTS = 500
 MIN_POINTS = 150
 MIN_GRADIENT = 2.5
 """Grey levels a pixel: flatter floor gives no information."""
-RANGE_M = 2.6
-HALF_WIDTH_M = 1.6
+RANGE_HEIGHTS = 2.6 / 0.3545
+HALF_WIDTH_HEIGHTS = 1.6 / 0.3545
+"""Floor that is compared, in heights of the camera: so far, a pixel shows as much of the floor at any height."""
 MIN_SHARE = 0.5
 SETTLE_M = 0.06
 SETTLE_RAD = math.radians(3.0)
@@ -117,7 +118,8 @@ def align_pictures(
     """
     pixels = _strong_pixels(key, floor)
     points, _ = projector.floor_points(pixels.astype(np.float64), key_attitude)
-    near = (points[:, 0] < RANGE_M) & (np.abs(points[:, 1]) < HALF_WIDTH_M)
+    height_m = projector.geometry.height_m
+    near = (points[:, 0] < RANGE_HEIGHTS * height_m) & (np.abs(points[:, 1]) < HALF_WIDTH_HEIGHTS * height_m)
     pixels, points = pixels[near], points[near]
     if len(pixels) < MIN_POINTS:
         return None

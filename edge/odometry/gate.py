@@ -17,7 +17,7 @@ MAX_NUMBER = 1e7
 """Largest position, angle or speed of a measurement; larger ones would break arithmetic."""
 
 
-# Bounds of the checks: the fault matrix's, and the Go2's own limits (3.8 m/s, 4 rad/s).
+# Bounds of the checks: the fault matrix's, and speeds above the fastest that any robot file permits (3.8 m/s, 4 rad/s).
 MAX_SPEED_MPS = 4.0
 MAX_TURN_RADPS = 6.0
 JUMP_M = 0.25

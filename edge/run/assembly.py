@@ -145,7 +145,12 @@ def assemble(
     )
     semantic = semantic_config(artifacts, options.mode)
     watch = WatchConfig.standard(
-        config, period_ns, image_px=runtime.image_px, camera_hz=robot.camera.rate_hz, semantic=semantic
+        config,
+        period_ns,
+        image_px=runtime.image_px,
+        camera_hz=robot.camera.rate_hz,
+        hfov_deg=None if robot.mount is None else robot.mount.hfov_deg,
+        semantic=semantic,
     )
     sources = Sources(
         findings=inputs.findings,

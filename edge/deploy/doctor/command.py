@@ -31,6 +31,7 @@ from edge.core.cli import (
     write_result,
 )
 from edge.core.device import available_providers, package_version
+from edge.deploy.doctor import link as doctor_link
 from edge.deploy.doctor import machine as doctor_machine
 from edge.deploy.doctor import rights as doctor_rights
 from edge.deploy.doctor import robot as doctor_robot
@@ -126,7 +127,7 @@ def examine(args: argparse.Namespace, root: Path = ROOT) -> Iterator[Check]:
     yield from _graphs(args, loaded, plan)
     yield robot_check
     if robot is not None:
-        yield doctor_robot.cable(robot.network.interface, root)
+        yield from doctor_link.robot_links(robot, root, user)
         yield doctor_robot.bridge(robot)
         yield from doctor_robot.robot_link(robot, 448 if loaded is None else loaded.runtime.image_px)
 

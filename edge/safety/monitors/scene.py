@@ -26,7 +26,7 @@ CELL: Final = 4
 """Blocks along each side of a cell. Counting cells gives a small, busy overlay little weight."""
 CELLS: Final = GRID // CELL
 FOCAL_BLOCKS: Final = 13.0
-"""Focal length of a 100° camera, blocks; a narrower camera sees more motion than expected, never less."""
+"""Focal length of a 100° camera, blocks; a narrower camera sees more motion than expected, a wider one less."""
 DEPTH_M: Final = 5.0
 """Assumed distance of the scene, m: the floor ahead and most indoor walls are nearer."""
 
@@ -67,6 +67,13 @@ class SceneConfig:
     """Share of all blocks above which a change proves a live picture whatever was predicted."""
     release_pictures: int = 10
     """Live pictures in a row that end a frozen verdict: rotating stale buffers appear live for a moment."""
+    focal_blocks: float = FOCAL_BLOCKS
+    """Focal length by which motion is predicted, blocks."""
+
+    @staticmethod
+    def for_hfov(hfov_deg: float) -> SceneConfig:
+        """Return the configuration for a camera: a wider one than the usual is expected to show less motion."""
+        return SceneConfig(focal_blocks=min(FOCAL_BLOCKS, GRID / 2 / math.tan(math.radians(hfov_deg) / 2)))
 
     def __post_init__(self) -> None:
         if not all(math.isfinite(value) and value > 0 for value in vars(self).values()):
@@ -152,7 +159,7 @@ class SceneMonitor:
         if counts[best] > config.overlay_share * GRID * GRID:
             return ""
         motion = SE2(*self._poses[rows[best]]).inverse() @ T_odom_base
-        judged = expected_change(self._greys[rows[best]], motion) >= config.expected_levels
+        judged = expected_change(self._greys[rows[best]], motion, config.focal_blocks) >= config.expected_levels
         judged_in_cell, changed_in_cell = _per_cell(judged), _per_cell(judged & changed[best])
         textured = judged_in_cell >= 2
         cells = int(np.count_nonzero(textured))
@@ -168,14 +175,14 @@ class SceneMonitor:
         )
 
 
-def expected_change(grey: _Grey, motion: SE2) -> npt.NDArray[np.float32]:
+def expected_change(grey: _Grey, motion: SE2, focal_blocks: float = FOCAL_BLOCKS) -> npt.NDArray[np.float32]:
     """Change that `motion` (robot frame, m and rad) makes in each block of a grey copy [32, 32]; levels of 255.
 
     Gradient times image motion of a forward pinhole camera and a scene `DEPTH_M` away, at most one block. The result is
     zero for edges along the image motion, such as those of a corridor ahead.
     """
     dy, dx = np.gradient(grey.astype(np.float32))
-    across = FOCAL_BLOCKS * (motion.theta_rad + motion.y_m / DEPTH_M) + _U * (motion.x_m / DEPTH_M)
+    across = focal_blocks * (motion.theta_rad + motion.y_m / DEPTH_M) + _U * (motion.x_m / DEPTH_M)
     down = _V * (motion.x_m / DEPTH_M)
     change: npt.NDArray[np.float32] = np.abs(dx * np.clip(across, -1, 1) + dy * np.clip(down, -1, 1)).astype(np.float32)
     return change

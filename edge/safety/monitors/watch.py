@@ -16,6 +16,7 @@ from edge.safety.monitors.frame import FrameConfig, FrameMonitor, FrameOutputs
 from edge.safety.monitors.machine import MachineMonitor
 from edge.safety.monitors.output import OutputConfig, OutputMonitor
 from edge.safety.monitors.robot import Attitude, RobotMonitor, RobotWatchConfig
+from edge.safety.monitors.scene import SceneConfig
 from edge.safety.monitors.semantic import SemanticConfig, SemanticMonitor
 from edge.state.frame import Frame
 from edge.state.pose_history import StampedPose
@@ -65,13 +66,18 @@ class WatchConfig:
         *,
         image_px: int | None = None,
         camera_hz: float | None = None,
+        hfov_deg: float | None = None,
         semantic: SemanticConfig | None = None,
     ) -> WatchConfig:
-        """Return the fault matrix's values for a robot and a tick; `image_px` None: any picture size."""
+        """Return the fault matrix's values for a robot and a tick.
+
+        `image_px` None: any picture size; `hfov_deg` None: the usual camera.
+        """
         tick_hz = 1e9 / period_ns
+        scene = SceneConfig() if hfov_deg is None else SceneConfig.for_hfov(hfov_deg)
         stale_ms = min(controller.odometry_max_age_ms, RobotWatchConfig.stale_ms)
         return WatchConfig(
-            frame=FrameConfig(image_px, tick_hz if camera_hz is None else min(camera_hz, tick_hz)),
+            frame=FrameConfig(image_px, tick_hz if camera_hz is None else min(camera_hz, tick_hz), scene=scene),
             output=OutputConfig(controller.limits, controller.step_s, period_ns / 1e9),
             semantic=semantic or SemanticConfig(),
             robot=RobotWatchConfig(late_ms=min(RobotWatchConfig.late_ms, stale_ms), stale_ms=stale_ms),

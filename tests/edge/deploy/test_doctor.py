@@ -24,6 +24,7 @@ from edge.deploy.doctor.command import examine, main, parser
 from edge.deploy.doctor.graphs import Placement, judge_placement, judge_ticks, placements, profile_graph
 from edge.deploy.doctor.robot import bridge, robot_link
 from edge.inference.graph import CPU_PROVIDER
+from edge.run.robot_reader import RobotCamera
 from export.targets.file import load_target
 from firmware_bridge.core.config import RobotConfig, load_robot_config
 from firmware_bridge.core.link import BridgeStatus
@@ -167,7 +168,7 @@ class FakeRobot:
 
 
 def checked(robot: RobotConfig, fake: FakeRobot) -> list[Check]:
-    checks = robot_link(robot, 224, open_reader=lambda _robot: fake, timeout_s=0.0)
+    checks = robot_link(robot, 224, opener=lambda _robot: (fake, RobotCamera(fake.request_frame)), timeout_s=0.0)
     assert fake.closed
     return checks
 
@@ -197,10 +198,10 @@ def test_a_second_robot_on_the_network_fails_and_is_named(robot: RobotConfig) ->
 
 
 def test_a_bus_that_cannot_be_joined_fails(robot: RobotConfig) -> None:
-    def refuse(_robot: RobotConfig) -> FakeRobot:
+    def refuse(_robot: RobotConfig) -> Any:
         raise DdsError("DDS: cannot join domain 0 on interface 'eth0'")
 
-    assert [check.level for check in robot_link(robot, 224, open_reader=refuse)] == [Level.FAIL, Level.SKIP]
+    assert [check.level for check in robot_link(robot, 224, opener=refuse)] == [Level.FAIL, Level.SKIP]
 
 
 def run(tmp_path: Path, *words: str) -> tuple[int, dict[str, Any]]:

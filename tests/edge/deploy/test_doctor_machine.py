@@ -13,6 +13,7 @@ from rich.console import Console
 from edge.artifacts.target_facts import GIB, PlanFacts, TargetFacts
 from edge.core.device import CUDA
 from edge.deploy.doctor.check import Check, Level, failed, skipped, table
+from edge.deploy.doctor.link import cable
 from edge.deploy.doctor.machine import (
     busy_programs,
     clocks,
@@ -25,7 +26,6 @@ from edge.deploy.doctor.machine import (
     processor_ticks,
     wall_clock,
 )
-from edge.deploy.doctor.robot import cable
 from edge.inference.graph import CPU_PROVIDER
 
 ORIN = TargetFacts("orin", ("aarch64",), 8, 16 * GIB, 12 * GIB, "36.4", "40W", 25.0)

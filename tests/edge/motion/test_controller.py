@@ -36,6 +36,17 @@ def settled(trajectory: np.ndarray) -> tuple[float, float]:
     return command.vx_mps, command.wz_radps
 
 
+def test_a_base_that_cannot_move_sideways_follows_a_sideways_plan_by_turning() -> None:
+    limits = replace(LIMITS, vy_max_mps=0.0, vx_min_mps=0.0)
+    command = Controller(replace(CONFIG, limits=limits)).step(fresh(plan(0.03, 0.03)), 0)
+    assert command.vy_mps == 0.0 and command.target is not None and command.target.y_m > 0
+    x, y, theta = 0.0, 0.0, 0.0
+    speed, yaw_rate = settled(plan(0.03, 0.03))
+    for _ in range(100):
+        x, y, theta = x + 0.01 * speed * math.cos(theta), y + 0.01 * speed * math.sin(theta), theta + 0.01 * yaw_rate
+    assert (x, y) == (pytest.approx(0.3, abs=0.03), pytest.approx(0.3, abs=0.03))
+
+
 def test_before_the_first_semantic_state_the_command_is_zero() -> None:
     command = Controller(CONFIG).step(fresh(None), 0)
     assert (command.vx_mps, command.wz_radps, command.reason) == (0.0, 0.0, "no-semantic-state")

@@ -168,3 +168,15 @@ def test_a_large_jpeg_is_shrunk_while_it_is_decoded(width: int, expected: int) -
     grey = grey_frame(data.tobytes())
     assert grey is not None
     assert grey.shape[1] == expected
+
+
+@pytest.mark.parametrize(
+    ("height_m", "hfov_deg", "pitch_deg"), [(0.2, 90, 5), (1.0, 70, 15), (1.5, 90, 5)], ids=["low", "high", "higher"]
+)
+def test_a_camera_at_another_height_measures_as_well(height_m: float, hfov_deg: float, pitch_deg: float) -> None:
+    geometry = CameraGeometry(math.radians(hfov_deg), height_m, math.radians(pitch_deg), 0.2)
+    poses = along(SE2(0.04, 0.0, 0.05), 16)
+    answers = watch((picture(TEXTURE, pose, geometry=geometry) for pose in poses), VisualOdometry(geometry))
+    assert answers
+    found, true = total(answers), true_motion(poses, answers)
+    assert math.hypot(found.x_m - true.x_m, found.y_m - true.y_m) < 0.008

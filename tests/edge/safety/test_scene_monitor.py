@@ -16,7 +16,7 @@ import pytest
 from edge.core.geometry import SE2
 from edge.run.camera import Frame
 from edge.safety.monitors.frame import CONTENTS_KEPT, FrameConfig, FrameMonitor
-from edge.safety.monitors.scene import SceneConfig, SceneMonitor
+from edge.safety.monitors.scene import SceneConfig, SceneMonitor, expected_change
 
 PX = 128
 TICK_NS = 100_000_000
@@ -245,6 +245,17 @@ def test_a_brightness_that_flickers_is_no_fault(motion: tuple[float, float]) -> 
 def test_a_configuration_that_cannot_judge_is_refused(change: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="scene monitor"):
         replace(SceneConfig(), **change)
+
+
+@pytest.mark.parametrize("hfov_deg", [40.0, 70.0, 100.0])
+def test_a_camera_up_to_that_of_the_go2_is_judged_as_before(hfov_deg: float) -> None:
+    assert SceneConfig.for_hfov(hfov_deg) == SceneConfig()
+
+
+def test_a_wider_camera_is_expected_to_show_less_motion() -> None:
+    grey, turn = np.random.default_rng(0).integers(0, 255, (32, 32)).astype(np.int16), SE2(0.0, 0.0, 0.05)
+    wide = expected_change(grey, turn, SceneConfig.for_hfov(140.0).focal_blocks)
+    assert wide.sum() < 0.6 * expected_change(grey, turn).sum()
 
 
 # --- pictures that are equal byte for byte ---------------------------------------------------------------------------
