@@ -53,8 +53,9 @@ def open_reader(
 ) -> tuple[RobotReader, CameraSource]:
     """Open the robot's reports and its camera; close the camera first.
 
-    `bus`: participant that a camera on ROS 2 shares; None gives it one of its own. `on_death` takes why the thread of the reports has ended, in that thread. Raises LinkOpenError, and
-    ModuleNotFoundError where the library of the protocol is missing.
+    `bus`: participant that a camera on ROS 2 shares; None gives it one of its own. `on_death` takes why the thread of
+    the reports has ended, in that thread. Raises LinkOpenError, and ModuleNotFoundError where the library of the
+    protocol is missing.
     """
     if robot.protocol != "unitree":  # only the bridge reads its link
         camera = open_camera(robot, bus)
