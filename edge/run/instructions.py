@@ -12,7 +12,7 @@ import socket
 import stat
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol
 
 from edge.reasoning.prompt import InstructionError, check_instruction
 from edge.run.stop_phrase import is_stop_phrase
@@ -90,6 +90,42 @@ class InstructionSocket:
         if sender:  # an unbound sender has no address
             with contextlib.suppress(OSError):  # the sender has closed its socket or does not read
                 self._socket.sendto(json.dumps(answer).encode(), sender)
+
+
+class InstructionChannel(Protocol):
+    """Where new instructions come from; no method waits but `poll` after a stop phrase."""
+
+    @property
+    def stopped(self) -> bool:
+        """Whether a stop phrase has been received."""
+
+    def poll(self) -> str | None:
+        """Return the newest valid instruction since the last poll; None without one or after a stop phrase."""
+
+    def close(self) -> None:
+        """Stop listening."""
+
+
+class InstructionChannels:
+    """Several channels as one: a stop phrase on one of them ends all."""
+
+    def __init__(self, *channels: InstructionChannel) -> None:
+        self._channels = channels
+
+    @property
+    def stopped(self) -> bool:
+        """Whether a stop phrase has been received."""
+        return any(channel.stopped for channel in self._channels)
+
+    def poll(self) -> str | None:
+        """Poll every channel; return the newest instruction of the last one that has one, None after a stop phrase."""
+        found = [channel.poll() for channel in self._channels]
+        return None if self.stopped else next((text for text in reversed(found) if text is not None), None)
+
+    def close(self) -> None:
+        """Close every channel."""
+        for channel in self._channels:
+            channel.close()
 
 
 def check_first_instruction(text: str) -> str:

@@ -31,6 +31,7 @@ from edge.state.pose_history import PoseHistory
 from firmware_bridge.client import BridgeClient, BridgeStatus
 from firmware_bridge.core.config import RobotConfig
 from firmware_bridge.core.robot_state import BatteryState, RobotState
+from firmware_bridge.dds.shared_bus import SharedBus
 from firmware_bridge.state_client import StateReader
 
 ODOMETRY_LOG_HZ = 50.0
@@ -67,8 +68,9 @@ class RobotInputs:
         commanded: Callable[[], tuple[float, float, float] | None],
         say: Callable[[str], None],
         on_death: Callable[[str], None] = lambda why: None,
+        bus: SharedBus | None = None,
     ) -> None:
-        """`commanded`: the velocity in force now; it must not wait.
+        """`commanded`: the velocity in force now; it must not wait. `bus`: as of `open_reader`.
 
         `on_death` takes why the thread of the reports or of the pictures has ended, in that thread.
         """
@@ -90,7 +92,7 @@ class RobotInputs:
         if mount is not None:
             hfov_rad, pitch_rad = math.radians(mount.hfov_deg), math.radians(mount.pitch_deg)
             self._eye = VisualOdometry(CameraGeometry(hfov_rad, mount.height_m, pitch_rad, mount.forward_m))
-        self.reader, self._source = open_reader(robot, on_death)
+        self.reader, self._source = open_reader(robot, on_death, bus)
         self.reader.set_state_listener(self._on_state)
         self.camera = CameraPoller(
             self._source.request_frame,

@@ -10,6 +10,7 @@ from edge.cameras.newest import CameraSource
 from edge.cameras.video_capture import VideoCaptureCamera
 from firmware_bridge.core.config import RobotConfig
 from firmware_bridge.core.robot_state import BatteryState, RobotState
+from firmware_bridge.dds.shared_bus import SharedBus
 from firmware_bridge.state_client import StateReader
 
 
@@ -48,15 +49,16 @@ class RobotCamera:
 
 
 def open_reader(
-    robot: RobotConfig, on_death: Callable[[str], None] = lambda why: None
+    robot: RobotConfig, on_death: Callable[[str], None] = lambda why: None, bus: SharedBus | None = None
 ) -> tuple[RobotReader, CameraSource]:
     """Open the robot's reports and its camera; close the camera first.
 
-    `on_death` takes why the thread of the reports has ended, in that thread. Raises LinkOpenError, and
-    ModuleNotFoundError where the library of the protocol is missing.
+    `bus`: participant that a camera on ROS 2 shares; None gives it one of its own. `on_death` takes why the thread of
+    the reports has ended, in that thread. Raises LinkOpenError, and ModuleNotFoundError where the library of the
+    protocol is missing.
     """
     if robot.protocol != "unitree":  # only the bridge reads its link
-        camera = open_camera(robot)
+        camera = open_camera(robot, bus)
         return StateReader(robot, on_death=on_death), camera
     from firmware_bridge.unitree.client import Go2Reader  # needs the extra of its protocol
 
@@ -64,7 +66,7 @@ def open_reader(
     return reader, RobotCamera(reader.request_frame) if robot.camera.source == "robot" else open_camera(robot)
 
 
-def open_camera(robot: RobotConfig) -> CameraSource:
+def open_camera(robot: RobotConfig, bus: SharedBus | None = None) -> CameraSource:
     """Open a camera that is not the robot's own; it connects in a thread of its own, so a missing one is no error yet.
 
     Raises LinkOpenError where a network cannot be joined.
@@ -75,4 +77,8 @@ def open_camera(robot: RobotConfig) -> CameraSource:
         return MjpegCamera(robot.camera.source, latency_ns=latency_ns)
     if kind in ("v4l2", "gstreamer"):
         return VideoCaptureCamera(kind, address, latency_ns=latency_ns)
-    raise ValueError(f"camera.source {robot.camera.source}: expected http, v4l2 or gstreamer")
+    if kind in ("ros2", "ros2raw"):
+        from edge.cameras.ros2 import Ros2Camera  # needs the extra of its protocol
+
+        return Ros2Camera(bus or robot.network, address, raw=kind == "ros2raw", latency_ns=latency_ns)
+    raise ValueError(f"camera.source {robot.camera.source}: expected http, v4l2, gstreamer, ros2 or ros2raw")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import threading
 import time
@@ -24,7 +25,7 @@ from edge.reasoning.generation_cycle import Mode
 from edge.reasoning.prompt import InstructionError
 from edge.run.arming import POLL_S, RefusedError, StoppedEarlyError, arm, disarm
 from edge.run.assembly import Engines, Loops, RunOptions, assemble
-from edge.run.instructions import InstructionSocket
+from edge.run.instructions import InstructionChannel, InstructionChannels, InstructionSocket
 from edge.run.result import run_record, run_result
 from edge.run.robot_inputs import CommandTap, RobotInputs
 from edge.run.service import ServiceReporter
@@ -33,6 +34,7 @@ from edge.safety.faults.table import FAULTS
 from edge.safety.watchdog import Hang, ReasoningWatch
 from firmware_bridge.client import BridgeClient, BridgeStatus, BridgeUnavailable
 from firmware_bridge.core.config import RobotConfig
+from firmware_bridge.dds.shared_bus import SharedBus
 from firmware_bridge.system.notify import Notifier
 
 CAMERA_LEAD = 0.5
@@ -75,6 +77,7 @@ class RunSession:
         self._schedule = schedule_for(artifacts)
         self._lines.extend(self._schedule.notes)
         self._loops: Loops | None = None
+        self._bus = SharedBus(robot.network) if robot.protocol == "ros2" else None  # of the camera and instructions
         self._reporter = ServiceReporter(Notifier(os.environ), tick_period_ns=self._period_ns, describe=self._describe)
         self._reporter.starting("opening the graphs", OPEN_S)
         if artifacts.guided_by_waypoints and options.mode is Mode.NO_REASONING:
@@ -100,18 +103,22 @@ class RunSession:
         self.hung = False
         """Whether reasoning hangs in a call that only the end of the process ends."""
 
-    def _open_instructions(self, bridge: BridgeClient) -> InstructionSocket | None:
-        if self._options.instructions is None:
-            return None
+    def _open_instructions(self, bridge: BridgeClient) -> InstructionChannels:
+        """Open the socket of the command line and the topic of the robot file. Raises RefusedError or DdsError."""
+        channels: list[InstructionChannel] = []
+        check, path, ros2 = self._engines.language.check_instruction, self._options.instructions, self._robot.ros2
+        stop = functools.partial(self._stop_by_phrase, bridge)
         try:
-            return InstructionSocket(
-                self._options.instructions,
-                check=self._engines.language.check_instruction,
-                stop=lambda: self._stop_by_phrase(bridge),
-                bridge=self._robot.bridge.socket,
-            )
+            if path is not None:
+                channels.append(InstructionSocket(path, check=check, stop=stop, bridge=self._robot.bridge.socket))
+            if ros2 is not None and ros2.instruction and self._bus is not None:
+                from edge.run.ros2_instructions import Ros2Instructions  # needs the extra of its protocol
+
+                topic = ros2.topic(ros2.instruction)
+                channels.append(Ros2Instructions(self._bus, topic, check, stop, self._lines.append))
         except OSError as error:
             raise RefusedError(str(error)) from error
+        return InstructionChannels(*channels)
 
     def _stop_by_phrase(self, bridge: BridgeClient) -> bool:
         """Stop the robot and end the run; return whether the bridge reports standstill within STANDSTILL_S."""
@@ -122,7 +129,7 @@ class RunSession:
         self._stop.set()
         return disarm(bridge, limit_s=STANDSTILL_S)
 
-    def _take_instructions(self, channel: InstructionSocket | None, loops: Loops) -> None:
+    def _take_instructions(self, channel: InstructionChannels | None, loops: Loops) -> None:
         """Forward a new instruction to reasoning; after a stop phrase the robot has been stopped on return."""
         if channel is not None and (instruction := channel.poll()) is not None:
             loops.reasoning.submit(instruction)
@@ -145,7 +152,7 @@ class RunSession:
         bridge = BridgeClient(self._robot.bridge.socket)
         inputs: RobotInputs | None = None
         recorder: Recorder | None = None
-        channel: InstructionSocket | None = None
+        channel: InstructionChannels | None = None
         result: dict[str, Any] | None = None
         end: Deadline | None = None
         try:
@@ -157,6 +164,7 @@ class RunSession:
                 commanded=lambda: sink.commanded,
                 say=self._lines.append,
                 on_death=self._end_by,
+                bus=self._bus,
             )
             inputs.camera.start()
             self._await_inputs(inputs, bridge)
@@ -217,6 +225,8 @@ class RunSession:
                 end.run("close-power", self._loops.power.close)
             if inputs is not None:
                 end.run("close-inputs", inputs.close)
+            if self._bus is not None:
+                end.run("close-bus", self._bus.close)
             self._print_lines()
         return result
 
@@ -254,7 +264,7 @@ class RunSession:
                     self._print(f"waiting for the robot: no {missing} yet, is it on?")
             time.sleep(POLL_S)
 
-    def _arm(self, bridge: BridgeClient, loops: Loops, channel: InstructionSocket | None) -> int:
+    def _arm(self, bridge: BridgeClient, loops: Loops, channel: InstructionChannels | None) -> int:
         """Arm, after an operator where the robot file requires one; return the last sequence number used.
 
         Raises RefusedError after a stop phrase, StoppedEarlyError after another request to stop.
@@ -286,7 +296,7 @@ class RunSession:
         )
 
     def _drive(
-        self, loops: Loops, inputs: RobotInputs, bridge: BridgeClient, channel: InstructionSocket | None
+        self, loops: Loops, inputs: RobotInputs, bridge: BridgeClient, channel: InstructionChannels | None
     ) -> Deadline:
         """Run both threads to their end while this thread watches them; return the deadline of the shutdown."""
         # The bridge's deadman is already running: the first command must not wait for a whole period.
@@ -344,7 +354,7 @@ class RunSession:
 
         return target
 
-    def _watch_run(self, loops: Loops, inputs: RobotInputs, channel: InstructionSocket | None) -> None:
+    def _watch_run(self, loops: Loops, inputs: RobotInputs, channel: InstructionChannels | None) -> None:
         """Forward lines and instructions and watch reasoning until a thread has ended or a stop is requested."""
         reasoning, message, watch = loops.reasoning, "", ReasoningWatch()
         while not self._finished.wait(POLL_S):

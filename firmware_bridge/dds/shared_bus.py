@@ -1,11 +1,14 @@
-"""One participant for several readers of a process that are opened at different times."""
+"""One participant for several readers of a process that are opened at different times; loads DDS when it is opened."""
 
 from __future__ import annotations
 
 import threading
+from typing import TYPE_CHECKING
 
 from firmware_bridge.core.sections import DdsConfig
-from firmware_bridge.dds.bus import Bus
+
+if TYPE_CHECKING:
+    from firmware_bridge.dds.bus import Bus
 
 
 class SharedBus:
@@ -18,6 +21,8 @@ class SharedBus:
 
     def open(self) -> Bus:
         """Return the participant. Raises DdsError while the domain cannot be joined; the next call tries again."""
+        from firmware_bridge.dds.bus import Bus  # needs the extra of its protocol
+
         with self._lock:
             if self._bus is None:
                 self._bus = Bus(self.network)

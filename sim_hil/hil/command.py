@@ -61,8 +61,8 @@ EPILOG: Final = """examples:
   IMPAIRMENT of both directions: loss_percent, loss_burst (mean length), delay_ms, jitter_ms (standard deviation),
              duplicate_percent, reorder_percent, reorder_ms (20)
   default    udp:127.0.0.1:14580,to=127.0.0.1:14540,to=127.0.0.1:14550
-ros2: the base stops by itself after 0.5 s without a Twist on /cmd_vel; it publishes /odom, /imu, /battery_state, /tf and
-  /camera/image/compressed with /camera/camera_info
+ros2: the base stops by itself after 0.5 s without a Twist on /cmd_vel; it publishes /odom, /imu, /battery_state, /tf,
+  /camera/image/compressed and /camera/camera_info
 camera: TCP port of the HTTP camera stream, default 8090
 
 with --faults, a datagram with one JSON object switches a fault, such as {"fault": "camera-stop", "on": true}; the

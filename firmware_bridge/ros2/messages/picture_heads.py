@@ -41,7 +41,7 @@ def split_picture(kind: Any, data: bytes) -> tuple[Any, bytes]:
     try:
         head = kind.deserialize(data)
         start = len(head.serialize())
-    except Exception as error:  # noqa: BLE001 - the decoder of a hostile sample may raise anything
+    except Exception as error:
         raise ValueError(f"{len(data)} bytes are no {kind.__name__.removesuffix('Head_')}") from error
     octets = data[start : start + head.size]
     if len(octets) != head.size:

@@ -14,12 +14,15 @@ from typing import Any
 import pytest
 
 from edge.cameras.mjpeg import MjpegCamera
+from edge.cameras.newest import CameraSource
+from edge.cameras.ros2 import Ros2Camera
 from edge.cameras.video_capture import VideoCaptureCamera
 from edge.run.robot_inputs import RobotInputs
 from edge.run.robot_reader import open_camera, open_reader
 from firmware_bridge.client_link import ClientLink
 from firmware_bridge.core.config import OBSERVER_SUFFIX, RobotConfig, Ros2Config, load_robot_config
-from firmware_bridge.core.robot_state import BatteryState, RobotState
+from firmware_bridge.core.robot_state import BatteryState, CameraError, RobotState
+from firmware_bridge.dds.shared_bus import SharedBus
 from firmware_bridge.state_client import StateReader
 from sim_hil.protocols.camera_stream import CameraServer, Shutter, listen
 from tests.edge.run.test_camera_poller import jpeg
@@ -31,9 +34,7 @@ MS = 1_000_000
 def robot_with(folder: Path, source: str) -> RobotConfig:
     go2 = load_robot_config(GO2_SIM, socket=folder / "bridge.sock")
     camera = replace(go2.camera, source=source)
-    return replace(
-        go2, protocol="ros2", ros2=Ros2Config(base_timeout_ms=500, battery="battery"), camera=camera, mount=None
-    )
+    return replace(go2, protocol="ros2", ros2=Ros2Config(500, battery="battery"), camera=camera, mount=None)
 
 
 def until(done: Callable[[], object], meanwhile: Callable[[], object] = lambda: None) -> None:
@@ -119,11 +120,31 @@ def test_without_a_bridge_that_is_why_a_state_is_missing(tmp_path: Path) -> None
         ("http://127.0.0.1:9/s", MjpegCamera),
         ("v4l2:/dev/video99", VideoCaptureCamera),
         ("gstreamer:videotestsrc ! appsink", VideoCaptureCamera),
+        ("ros2:/camera/image/compressed", Ros2Camera),
+        ("ros2raw:/camera/image", Ros2Camera),
     ],
 )
 def test_the_source_decides_which_camera_is_opened(tmp_path: Path, source: str, kind: type) -> None:
     with closing(open_camera(robot_with(tmp_path, source))) as camera:
         assert isinstance(camera, kind)
+
+
+def test_a_camera_on_ros_2_shares_the_runners_participant(tmp_path: Path, dds_domain: int) -> None:
+    """A second participant of this process in the domain would be refused."""
+    robot = robot_with(tmp_path, "ros2:/camera/image/compressed")
+    bus = SharedBus(replace(robot.network, domain=dds_domain))
+    kept = bus.open()
+    with closing(open_camera(robot, bus)) as camera:
+        until(lambda: "no node publishes" in error_of(camera))
+    assert bus.open() is kept
+    bus.close()
+
+
+def error_of(camera: CameraSource) -> str:
+    """Why the camera has no picture."""
+    with pytest.raises(CameraError) as error:
+        camera.request_frame(0.01)
+    return str(error.value)
 
 
 def test_a_robot_of_another_protocol_is_read_through_the_bridge(tmp_path: Path) -> None:

@@ -222,7 +222,8 @@ def test_a_base_without_a_timeout_of_its_own_is_announced(dds_domain: int) -> No
     assert len(lines) == 1 and "the base may drive on" in lines[0]
 
 
-GOOD = [odometry(5).serialize(), imu().serialize(), battery().serialize(), Twist_(Vector3_(1.0, 0.0, 0.0), Vector3_(0.0, 0.0, 0.0)).serialize()]  # fmt: skip
+FORWARD = Twist_(Vector3_(1.0, 0.0, 0.0), Vector3_(0.0, 0.0, 0.0))
+GOOD = [message.serialize() for message in (odometry(5), imu(), battery(), FORWARD)]
 
 
 @pytest.fixture
