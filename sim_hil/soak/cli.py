@@ -138,7 +138,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
     with stop_signals() as stop:
         failure = ""
-        lost = (lambda: None) if args.to_the_end else (lambda: lost_budget(soak, budget))
+
+        def lost() -> str | None:
+            return None if args.to_the_end else lost_budget(soak, budget)
+
         try:
             with Progress("edge-soak: ", period_s=STATUS_PERIOD_S) as progress:
                 finished = run_legs(

@@ -45,7 +45,7 @@ class Trend(NamedTuple):
     low: float
     high: float
     begin: float
-    count: int
+    number: int
 
 
 def _of_lives(stamps: str, values: str) -> Callable[[Analysis], tuple[list[int], list[float | None]]]:

@@ -197,7 +197,7 @@ def measures(legs: Sequence[Analysis], samples: Sequence[Samples], menu: Sequenc
     found["faults_covered_percent"] = Measure(covered, "% of the menu", len(menu))
     for name, line in trends(legs).items():
         low, high = (None, None) if line is None else (round(line.low, 3), round(line.high, 3))
-        value, count = (None, 0) if line is None else (round(line.per_h, 3), line.count)
+        value, count = (None, 0) if line is None else (round(line.per_h, 3), line.number)
         found[f"trend_per_h.{name}"] = Measure(value, f"{SERIES[name].unit}/h", count, low, high)
     gaps = [leg["nearest_person"][1] for leg in legs if leg["nearest_person"] is not None]
     found["nearest_person_m.min"] = Measure(min(gaps, default=None), "m", len(gaps))

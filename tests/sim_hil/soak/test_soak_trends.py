@@ -25,7 +25,7 @@ def leg(begin_ns: int, minutes: int, first_ms: float, per_minute_ms: float) -> d
 def test_a_growth_over_legs_of_two_machines_is_one_line() -> None:
     found = trends([leg(5 * S, 20, 10.0, 0.1), leg(900_000 * S, 20, 12.0, 0.1)])["tick_ms.p99"]
     assert found is not None
-    assert found.count == 40
+    assert found.number == 40
     assert found.per_h == pytest.approx(6.0, rel=0.1)
     assert found.low < 6.0 < found.high
 
