@@ -1,7 +1,8 @@
 """MAVSDK and MAVProxy, unmodified, watch a driven rover; MAVProxy's mode command latches the bridge within 100 ms.
 
-Both live in environments of their own: tools/interop/install_mavproxy.sh DIR and tools/interop/install_mavsdk.sh DIR, then
-TIC_VLA_MAVPROXY=DIR/venv/bin/mavproxy.py and TIC_VLA_MAVSDK_PYTHON=DIR/venv/bin/python. Without them this test is skipped.
+Both live in environments of their own: tools/interop/install_mavproxy.sh DIR and tools/interop/install_mavsdk.sh DIR,
+then TIC_VLA_MAVPROXY=DIR/venv/bin/mavproxy.py and TIC_VLA_MAVSDK_PYTHON=DIR/venv/bin/python. Without them this test is
+skipped.
 The figures: python -m tools.interop.takeover --help.
 """
 
