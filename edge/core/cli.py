@@ -199,7 +199,7 @@ _EXTRAS: Final = {
     "onnxruntime": "cpu", "cyclonedds": "unitree", "pymavlink": "mavlink", "can": "can", "cantools": "can",
     "torch": "export", "onnx": "export", "onnxscript": "export", "safetensors": "export", "jinja2": "export",
     "pybullet": "sim", "panda3d": "sim", "direct": "sim", "scipy": "sim", "gymnasium": "sim", "matplotlib": "sim",
-    "cryptography": "sign", "ray": "cluster",
+    "cryptography": "sign", "ray": "cluster", "aiohttp": "live", "prometheus_client": "live",
 }  # fmt: skip
 
 

@@ -4,14 +4,40 @@ due."""
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from edge.core.geometry import SE2
+from edge.flightlog.part import Payload
 from edge.odometry.drift_rate import DriftRate
 from firmware_bridge.core.robot_state import BatteryState, RobotState
+
+
+class RecordSink(Protocol):
+    """Takes records without making the caller wait: a recorder, or a live view."""
+
+    def put(self, topic: str, stamp_ns: int, payload: Payload) -> None:
+        """Take one record; never blocks, never raises."""
+
+
+class RecordSinks:
+    """Several sinks as one."""
+
+    def __init__(self, *sinks: RecordSink) -> None:
+        self._sinks = sinks
+
+    @staticmethod
+    def of(*sinks: RecordSink | None) -> RecordSinks | None:
+        """Return those that there are as one sink; None without any."""
+        found = [sink for sink in sinks if sink is not None]
+        return RecordSinks(*found) if found else None
+
+    def put(self, topic: str, stamp_ns: int, payload: Payload) -> None:
+        """Give the record to every sink."""
+        for sink in self._sinks:
+            sink.put(topic, stamp_ns, payload)
 
 
 class Throttle:

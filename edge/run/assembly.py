@@ -10,12 +10,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from edge.artifacts.manifest import Artifacts
-from edge.flightlog.recorder import Recorder
+from edge.flightlog.records import RecordSink
 from edge.inference.generation_task import GenerationModels
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
 from edge.inference.release import ReleaseDelay
 from edge.inference.scheduling import GiveWay, Schedule, TickActivity
+from edge.live.feed import LiveOptions
 from edge.motion.controller import Controller, ControllerConfig
 from edge.power.governor.plan import read_power_plan
 from edge.power.monitor import Activity, PowerMonitor
@@ -50,6 +51,8 @@ class RunOptions:
     record: Path | None
     instructions: Path | None = None
     """Socket that takes further instructions while the robot drives."""
+    live: LiveOptions | None = None
+    """Where the live view listens; None: there is none."""
     switches: SwitchOptions = field(default_factory=SwitchOptions)
     """Decoding rules and recoveries of the command line."""
 
@@ -89,7 +92,7 @@ def assemble(
     options: RunOptions,
     inputs: RobotInputs,
     sink: CommandTap,
-    recorder: Recorder | None,
+    recorder: RecordSink | None,
     *,
     stop: threading.Event,
     say: Callable[[str], None],

@@ -14,8 +14,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Protocol
 
+from edge.live.feed import LiveError, LiveFeed, LiveOptions
 from edge.reasoning.prompt import InstructionError, check_instruction
+from edge.run.arming import RefusedError
+from edge.run.assembly import RunOptions
 from edge.run.stop_phrase import is_stop_phrase
+from firmware_bridge.core.config import RobotConfig
+from firmware_bridge.dds.shared_bus import SharedBus
 
 MAX_BYTES: Final = 4096
 """Largest datagram, bytes: 400 characters of an instruction, each in its longest JSON escape."""
@@ -126,6 +131,39 @@ class InstructionChannels:
         """Close every channel."""
         for channel in self._channels:
             channel.close()
+
+
+def open_live(options: LiveOptions, bridge: Path, stop: Callable[[], bool], say: Callable[[str], None]) -> LiveFeed:
+    """Start the live view and print its address. Raises RefusedError."""
+    try:
+        live = LiveFeed(options, bridge, stop, say)
+    except LiveError as error:
+        raise RefusedError(str(error)) from error
+    say(f"live view: {live.url}")
+    return live
+
+
+def open_channels(
+    options: RunOptions,
+    robot: RobotConfig,
+    bus: SharedBus | None,
+    check: Callable[[str], None],
+    stop: Callable[[], bool],
+    say: Callable[[str], None],
+    live: LiveFeed | None,
+) -> InstructionChannels:
+    """Open the socket of the options and the robot file's topic, beside a live view. Raises RefusedError, DdsError."""
+    channels: list[InstructionChannel] = [] if live is None else [live]
+    try:
+        if options.instructions is not None:
+            channels.append(InstructionSocket(options.instructions, check, stop, robot.bridge.socket))
+        if robot.ros2 is not None and robot.ros2.instruction and bus is not None:
+            from edge.run.ros2_instructions import Ros2Instructions  # needs the extra of its protocol
+
+            channels.append(Ros2Instructions(bus, robot.ros2.topic(robot.ros2.instruction), check, stop, say))
+    except OSError as error:
+        raise RefusedError(str(error)) from error
+    return InstructionChannels(*channels)
 
 
 def check_first_instruction(text: str) -> str:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from edge.core.stats import Samples
-from edge.flightlog.recorder import Recorder
+from edge.flightlog.records import RecordSink
 from edge.inference.generation_task import GENERATION_ERRORS, GenerationModels, GenerationResult, GenerationTask
 from edge.inference.graph import CancelledError, Interrupt
 from edge.inference.scheduling import REASONING_NICENESS, GiveWay, Role, enter
@@ -71,7 +71,7 @@ class ReasoningSchedule:
 class ReasoningOutputs:
     """Sinks of the reasoning thread's log records and messages."""
 
-    recorder: Recorder | None = None
+    recorder: RecordSink | None = None
     say: Callable[[str], None] = lambda _line: None
     """Takes one line for the operator."""
 

@@ -15,8 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.flightlog.recorder import Recorder
-from edge.flightlog.records import Throttle, battery_record, odometry_record
+from edge.flightlog.records import RecordSink, Throttle, battery_record, odometry_record
 from edge.odometry.calibration import OdometryCalibration, load_calibration
 from edge.odometry.camera_geometry import Attitude, CameraGeometry
 from edge.odometry.estimator import DriftEstimator, OdometryOutputs
@@ -80,7 +79,7 @@ class RobotInputs:
         self.findings = FindingQueue()
         self.states = 0
         """Reports so far."""
-        self.recorder: Recorder | None = None
+        self.recorder: RecordSink | None = None
         """Where reports are logged, once there is a log."""
         self._commanded = commanded
         self._say = say
@@ -170,7 +169,7 @@ class RobotInputs:
 
     def _log(
         self,
-        recorder: Recorder,
+        recorder: RecordSink,
         state: RobotState,
         outputs: OdometryOutputs,
         commanded: tuple[float, float, float] | None,

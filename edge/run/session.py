@@ -16,16 +16,18 @@ from edge.artifacts.files import ArtifactError
 from edge.artifacts.manifest import Artifacts
 from edge.core.deadline import Deadline
 from edge.flightlog.recorder import Recorder, space_refusal
+from edge.flightlog.records import RecordSinks
 from edge.inference.graph import GraphError
 from edge.inference.language import ContextOverflowError, LanguageModel
 from edge.inference.policy import Policy
 from edge.inference.scheduling import TickActivity, enter, freeze_garbage, lock_memory, schedule_for
 from edge.inference.warm_up import check_tick, warm_up
+from edge.live.feed import LiveFeed
 from edge.reasoning.generation_cycle import Mode
 from edge.reasoning.prompt import InstructionError
 from edge.run.arming import POLL_S, RefusedError, StoppedEarlyError, arm, disarm
 from edge.run.assembly import Engines, Loops, RunOptions, assemble
-from edge.run.instructions import InstructionChannel, InstructionChannels, InstructionSocket
+from edge.run.instructions import InstructionChannels, open_channels, open_live
 from edge.run.result import run_record, run_result
 from edge.run.robot_inputs import CommandTap, RobotInputs
 from edge.run.service import ServiceReporter
@@ -52,6 +54,7 @@ STANDSTILL_S = 2.0
 """Time for the robot to come to rest and report it, s."""
 STOP_PHRASE = f"{FAULTS['stop-phrase'].message} {FAULTS['stop-phrase'].advice}"
 """Fault that ends a run when the instruction channel brings a stop phrase."""
+LIVE_STOP = "The live view's STOP button has ended the run. Start a new run when the way is free."
 LINES = 200
 """Lines for the operator that wait to be printed; more are dropped, oldest first."""
 
@@ -103,28 +106,11 @@ class RunSession:
         self.hung = False
         """Whether reasoning hangs in a call that only the end of the process ends."""
 
-    def _open_instructions(self, bridge: BridgeClient) -> InstructionChannels:
-        """Open the socket of the command line and the topic of the robot file. Raises RefusedError or DdsError."""
-        channels: list[InstructionChannel] = []
-        check, path, ros2 = self._engines.language.check_instruction, self._options.instructions, self._robot.ros2
-        stop = functools.partial(self._stop_by_phrase, bridge)
-        try:
-            if path is not None:
-                channels.append(InstructionSocket(path, check=check, stop=stop, bridge=self._robot.bridge.socket))
-            if ros2 is not None and ros2.instruction and self._bus is not None:
-                from edge.run.ros2_instructions import Ros2Instructions  # needs the extra of its protocol
-
-                topic = ros2.topic(ros2.instruction)
-                channels.append(Ros2Instructions(self._bus, topic, check, stop, self._lines.append))
-        except OSError as error:
-            raise RefusedError(str(error)) from error
-        return InstructionChannels(*channels)
-
-    def _stop_by_phrase(self, bridge: BridgeClient) -> bool:
+    def _stop_by(self, bridge: BridgeClient, why: str) -> bool:
         """Stop the robot and end the run; return whether the bridge reports standstill within STANDSTILL_S."""
         bridge.stop()
-        if STOP_PHRASE not in self._faults:
-            self._faults.append(STOP_PHRASE)
+        if why not in self._faults:
+            self._faults.append(why)
         self._stop_requested = True
         self._stop.set()
         return disarm(bridge, limit_s=STANDSTILL_S)
@@ -152,6 +138,7 @@ class RunSession:
         bridge = BridgeClient(self._robot.bridge.socket)
         inputs: RobotInputs | None = None
         recorder: Recorder | None = None
+        live: LiveFeed | None = None
         channel: InstructionChannels | None = None
         result: dict[str, Any] | None = None
         end: Deadline | None = None
@@ -172,18 +159,31 @@ class RunSession:
                 recorder = Recorder(self._options.record)
                 if recorder.error is not None:
                     raise RefusedError(recorder.error)
+            stop = functools.partial(self._stop_by, bridge)
+            if self._options.live is not None:
+                live = open_live(self._options.live, self._robot, functools.partial(stop, LIVE_STOP), self._print)
+            sinks = [each for each in (recorder, live) if each is not None]
+            records = RecordSinks(*sinks) if sinks else None
             loops = self._loops = assemble(
                 self._engines,
                 self._robot,
                 self._options,
                 inputs,
                 sink,
-                recorder,
+                records,
                 stop=self._stop,
                 say=self._lines.append,
                 on_tick=self._reporter.on_tick,
             )
-            channel = self._open_instructions(bridge)
+            channel = open_channels(
+                self._options.instructions,
+                self._robot,
+                self._bus,
+                check=self._engines.language.check_instruction,
+                stop=functools.partial(stop, STOP_PHRASE),
+                say=self._lines.append,
+                live=live,
+            )
             loops.power.start()
             # After everything that lives as long as the process has been made.
             if (refused := lock_memory()) is not None:
@@ -195,9 +195,9 @@ class RunSession:
             process = psutil.Process()
             process.cpu_percent()
             self._began = True
-            if recorder is not None:
-                recorder.put("/run", started_ns, run_record(self._artifacts, self._robot, self._options, started_ns))
-                inputs.recorder = recorder
+            if records is not None:
+                records.put("/run", started_ns, run_record(self._artifacts, self._robot, self._options, started_ns))
+                inputs.recorder = records
             end = self._drive(loops, inputs, bridge, channel)
             status = self._halt(bridge, end)
             result = run_result(
@@ -211,13 +211,15 @@ class RunSession:
                 duration_s=(time.monotonic_ns() - started_ns) / 1e9,
             )
             result["cpu_percent"] = process.cpu_percent()
-            if recorder is not None:
-                recorder.put("/result", time.monotonic_ns(), result)
+            if records is not None:
+                records.put("/result", time.monotonic_ns(), result)
         finally:
             # Whatever ended the run: closing the connection makes the bridge stop the robot.
             bridge.close()
             if channel is not None:
                 channel.close()
+            elif live is not None:
+                live.close()
             end = end or Deadline(END_S)
             if recorder is not None:
                 self._close_recorder(recorder, result, end)
@@ -273,7 +275,7 @@ class RunSession:
         def stop_requested() -> bool:
             self._take_instructions(channel, loops)
             if channel is not None and channel.stopped:
-                raise RefusedError(f"not armed: {STOP_PHRASE}")
+                raise RefusedError(f"not armed: {self._faults[-1] if self._faults else STOP_PHRASE}")
             return self._stop_requested
 
         def on_wait(text: str) -> None:
