@@ -115,9 +115,10 @@ class Session:
         number, sender = message.get_msgId(), (message.get_srcSystem(), message.get_srcComponent())
         if sender == (self._config.station, COMPONENT):
             self._clash_ns = now_ns  # an autopilot does not echo: a second bridge, or a forger
-        elif number in _OTHERS:
+        elif number in _OTHERS and sender != (self._config.system, AUTOPILOT):
             command = getattr(message, "command", 0)
-            if message.target_system in (0, self._config.system):
+            target = getattr(message, "target_system", getattr(message, "target", 0))  # MANUAL_CONTROL: `target`
+            if target in (0, self._config.system):
                 self._foreign = stations.foreign_message(number, command, sender) or self._foreign
         elif sender != (self._config.system, AUTOPILOT):
             # Heartbeats of ground stations that watch are welcome; every other value must be the autopilot's.
@@ -152,8 +153,11 @@ class Session:
             self._foreign = foreign
         if target not in (own, (0, 0)) or foreign is not None:
             return
+        waited = self.commands.waits(command)
         failed = self.commands.acknowledge(command, message.result)
-        if command == SET_INTERVAL and not self.commands.waits(SET_INTERVAL) and self._intervals:
+        if command == SET_INTERVAL:
+            if not waited or self.commands.waits(SET_INTERVAL) or not self._intervals:
+                return
             self._intervals.pop(0)  # one that the autopilot does not know is left out
         elif failed is not None:
             name = stations.MOTION_COMMANDS.get(command, f"command {command}")
