@@ -14,6 +14,7 @@ import argparse
 import math
 import os
 import select
+import socket
 import sys
 import tempfile
 import time
@@ -37,6 +38,7 @@ SPEED_MPS, RIPPLE_MPS, RADIUS_M = 0.25, 0.1, -0.5
 """Speed, its change to and fro, and the circle's radius to the right, which fits the corridor."""
 _COMMAND_NS = 100_000_000
 _CHUNK = 4096
+_BUFFER_BYTES = 4 * 1024 * 1024
 
 
 class Tap(Protocol):
@@ -57,6 +59,8 @@ class MulticastTap:
 
     def __init__(self, group: str) -> None:
         self._bus = LoopbackMulticastBus(group)
+        # A busy machine stops this process for half a second; the default buffer then loses frames of the trace.
+        self._bus._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
 
     def files(self) -> Sequence[int]:
         """Return the socket."""
@@ -163,10 +167,10 @@ def record(interface: str, duration_s: float, out: Path) -> int:
         tap: Tap = listener or SerialTap(folder / "can", folder / "tap")
         client = None
         try:
-            socket = folder / BRIDGE_SOCKET
+            path = folder / BRIDGE_SOCKET
             bridge = ["--robot", str(out / "robot.toml"), "--json", str(out / "edge-bridge.json")]
-            _start(children, "edge-bridge", bridge, lambda _: socket.exists())
-            client = BridgeClient(socket)
+            _start(children, "edge-bridge", bridge, lambda _: path.exists())
+            client = BridgeClient(path)
             with open_stream(out / "trace.log") as trace:
                 tap.take()  # what has passed before the bridge was there
                 return _drive(client, tap, trace, duration_s, lambda: children.check_others(None))
