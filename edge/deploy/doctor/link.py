@@ -155,7 +155,7 @@ def signing_key(key: Path | None, host: str, root: Path) -> Check:
     try:
         found = file.stat()
     except OSError as error:
-        advice = "create it as docs/robot.md shows, or run this as root"
+        advice = "create it as docs/your_robot.md shows, or run this as root"
         return Check(name, Level.FAIL, f"{key}: {error.strerror}", expected, advice)
     if found.st_mode & 0o077:
         advice = f"sudo chmod 0600 {key}, and make a new key: others may have read this one"
