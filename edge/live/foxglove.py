@@ -75,6 +75,8 @@ class Subscriptions:
             if operation == "unsubscribe":
                 ended = {_number(each) for each in request["subscriptionIds"]}
                 self._of_channel = {channel: id_ for channel, id_ in self._of_channel.items() if id_ not in ended}
+        except ProtocolError:
+            raise
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise ProtocolError(f"no request of the protocol: {type(error).__name__}") from error
         return []  # whatever else a client may ask for is not offered

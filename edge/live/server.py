@@ -203,8 +203,8 @@ class LiveServer:
         for message in self._state.snapshot():
             client.offer(message.topic, _page_data(message))
         async with self._connected(request, client, self._pages):
-            async for message in channel:
-                if message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
+            async for received in channel:
+                if received.type in (WSMsgType.TEXT, WSMsgType.BINARY):
                     await channel.close(code=WSCloseCode.POLICY_VIOLATION)  # the page sends nothing
         return channel
 
@@ -230,7 +230,8 @@ class LiveServer:
         """A new subscriber gets the newest message of each channel, also of those that come once."""
         for topic, (stamp_ns, data) in self._latest.items():
             channel = self._channels.id_of(topic)
-            if channel in channels and (frame := client.subscriptions.frame(channel, stamp_ns, data)) is not None:
+            frame = None if channel is None else client.subscriptions.frame(channel, stamp_ns, data)
+            if channel in channels and frame is not None:
                 client.offer(topic, frame)
 
     @contextlib.asynccontextmanager

@@ -9,6 +9,7 @@ from typing import Any
 
 from edge.artifacts.manifest import Artifacts
 from edge.core.stats import percentiles
+from edge.flightlog.recorder import Recorder
 from edge.run.assembly import RunOptions
 from edge.run.control_loop import ControlLoop, ControlStatistics
 from edge.run.reasoning_loop import ReasoningLoop
@@ -35,6 +36,20 @@ def run_record(artifacts: Artifacts, robot: RobotConfig, options: RunOptions, st
         "started_ns": started_ns,
         "tick_period_ms": artifacts.runtime.tick_period_ms,
     }
+
+
+def close_log(recorder: Recorder, result: dict[str, Any] | None, *, began: bool, left_s: float) -> str | None:
+    """Finish the flight log within `left_s`, add its statistics to the result, return a line on what it lacks."""
+    recorder.close(left_s)
+    if not began:
+        recorder.path.unlink(missing_ok=True)  # an empty log would mislead
+        return None
+    dropped = sum(recorder.dropped.values())
+    if result is not None:
+        result["recorder"] = recorder.statistics()
+    if recorder.error is not None:
+        return f"the flight log is incomplete: {recorder.error}"
+    return f"the flight log lacks {dropped} records: writing was slower than the run" if dropped else None
 
 
 def run_result(

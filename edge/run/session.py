@@ -28,7 +28,7 @@ from edge.reasoning.prompt import InstructionError
 from edge.run.arming import POLL_S, RefusedError, StoppedEarlyError, arm, disarm
 from edge.run.assembly import Engines, Loops, RunOptions, assemble
 from edge.run.instructions import InstructionChannels, open_channels, open_live
-from edge.run.result import run_record, run_result
+from edge.run.result import close_log, run_record, run_result
 from edge.run.robot_inputs import CommandTap, RobotInputs
 from edge.run.service import ServiceReporter
 from edge.safety.faults.findings import Finding
@@ -161,9 +161,9 @@ class RunSession:
                     raise RefusedError(recorder.error)
             stop = functools.partial(self._stop_by, bridge)
             if self._options.live is not None:
-                live = open_live(self._options.live, self._robot, functools.partial(stop, LIVE_STOP), self._print)
-            sinks = [each for each in (recorder, live) if each is not None]
-            records = RecordSinks(*sinks) if sinks else None
+                by_view = functools.partial(stop, LIVE_STOP)
+                live = open_live(self._options.live, self._robot.bridge.socket, by_view, self._print)
+            records = RecordSinks.of(recorder, live)
             loops = self._loops = assemble(
                 self._engines,
                 self._robot,
@@ -175,15 +175,8 @@ class RunSession:
                 say=self._lines.append,
                 on_tick=self._reporter.on_tick,
             )
-            channel = open_channels(
-                self._options.instructions,
-                self._robot,
-                self._bus,
-                check=self._engines.language.check_instruction,
-                stop=functools.partial(stop, STOP_PHRASE),
-                say=self._lines.append,
-                live=live,
-            )
+            by_phrase, check = functools.partial(stop, STOP_PHRASE), self._engines.language.check_instruction
+            channel = open_channels(self._options, self._robot, self._bus, check, by_phrase, self._lines.append, live)
             loops.power.start()
             # After everything that lives as long as the process has been made.
             if (refused := lock_memory()) is not None:
@@ -221,8 +214,8 @@ class RunSession:
             elif live is not None:
                 live.close()
             end = end or Deadline(END_S)
-            if recorder is not None:
-                self._close_recorder(recorder, result, end)
+            if recorder is not None and (line := close_log(recorder, result, began=self._began, left_s=end.left_s())):
+                self._print(line)
             if self._loops is not None:
                 end.run("close-power", self._loops.power.close)
             if inputs is not None:
@@ -392,19 +385,6 @@ class RunSession:
             if not self._faults:
                 self._faults.append(f"bridge lost: {error}")
         return status
-
-    def _close_recorder(self, recorder: Recorder, result: dict[str, Any] | None, end: Deadline) -> None:
-        recorder.close(end.left_s())
-        if not self._began:
-            recorder.path.unlink(missing_ok=True)  # an empty log would mislead
-            return
-        dropped = sum(recorder.dropped.values())
-        if result is not None:
-            result["recorder"] = recorder.statistics()
-        if recorder.error is not None:
-            self._print(f"the flight log is incomplete: {recorder.error}")
-        elif dropped:
-            self._print(f"the flight log lacks {dropped} records: writing was slower than the run")
 
     def _print_lines(self) -> None:
         while self._lines:
