@@ -25,6 +25,7 @@ from edge.deploy.unit_text import UnitError
 from edge.inference import engines
 from edge.reasoning.prompt import InstructionError
 from firmware_bridge.core.config import ConfigError
+from firmware_bridge.system.terminal import CommandParser
 
 EXAMPLES = """examples:
   edge-install engines --artifacts out/orin
@@ -46,7 +47,7 @@ exit codes: 0 done, 1 a step failed or systemd finds fault with the units, 2 bad
 
 def parser() -> argparse.ArgumentParser:
     """Command line of `edge-install`."""
-    p = argparse.ArgumentParser(
+    p = CommandParser(
         "edge-install", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     commands = p.add_subparsers(dest="command", required=True)

@@ -43,6 +43,7 @@ from edge.state.switches import Decoding, RecoverySwitch, SwitchOptions
 from firmware_bridge.client import BridgeUnavailable
 from firmware_bridge.core.config import ConfigError, RobotConfig, load_robot_config
 from firmware_bridge.core.robot_state import LinkOpenError
+from firmware_bridge.system.terminal import CommandParser
 
 EXAMPLES = """examples:
   edge-run --artifacts out/nano --robot go2.toml --instruction "walk to the vending machine"
@@ -68,7 +69,7 @@ SWITCH_INTERVAL_S = 0.0005
 
 def parser() -> argparse.ArgumentParser:
     """Command line of `edge-run`."""
-    p = argparse.ArgumentParser(
+    p = CommandParser(
         "edge-run", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     p.add_argument("--artifacts", type=Path, required=True, metavar="DIR", help="directory made by edge-export")
@@ -142,6 +143,7 @@ def read_options(args: argparse.Namespace) -> tuple[RobotConfig, RunOptions]:
             raise ConfigError(f"--record {there[0]}: exists; a flight log is never overwritten, name another file")
         if not args.record.parent.is_dir():
             raise ConfigError(f"--record {args.record}: there is no directory {args.record.parent}")
+        check_result_target(str(args.record), "--record")
     robot = load_robot_config(args.robot, socket=args.socket, domain=args.domain)
     options = RunOptions(
         instruction=check_first_instruction(args.instruction),

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, command_line, messages, write_result
+from firmware_bridge.system.terminal import CommandParser
 from tools.board import drive as board_drive
 from tools.board import journey
 from tools.board.journey import HOME, INPUT, INSTALLER, ROBOT_FILE
@@ -49,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         "python -m tools.board", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(

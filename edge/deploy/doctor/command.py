@@ -44,6 +44,7 @@ from edge.inference.graph import GraphError
 from edge.power.governor.plan import PowerPlan, read_power_plan
 from edge.power.meters.select import open_meter
 from firmware_bridge.core.config import ConfigError, RobotConfig, load_robot_config
+from firmware_bridge.system.terminal import CommandParser
 
 EXAMPLES = """examples:
   edge-doctor --artifacts out/orin --robot go2.toml
@@ -66,7 +67,7 @@ T = TypeVar("T")
 
 def parser() -> argparse.ArgumentParser:
     """Command line of `edge-doctor`."""
-    p = argparse.ArgumentParser(
+    p = CommandParser(
         "edge-doctor", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     p.add_argument("--artifacts", type=Path, metavar="DIR", help="directory made by edge-export")
