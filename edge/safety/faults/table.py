@@ -21,7 +21,6 @@ FAULTS: Mapping[str, Fault] = table(INPUTS, MODEL, MACHINE, BRIDGE, START)
 NOT_HERE: Mapping[int, str] = MappingProxyType(
     {
         32: "needs a real robot: power cut of the computer with the bridge",
-        41: "MAVLink: no robot file speaks it yet",
         43: "CAN: no robot file speaks it yet",
         44: "CAN: no robot file speaks it yet",
         45: "CAN: no robot file speaks it yet",

@@ -42,11 +42,11 @@ class Forger:
         self._writers[OTHER_SYSTEM].advance(ticks)
 
     def packets(self, genuine: bytes, kinds: Collection[str]) -> list[bytes]:
-        """Return the packets that follow a genuine one while the attacks `kinds` are on."""
+        """Return the packets that follow a genuine one while the attacks in `kinds` are on; other names are ignored."""
         recorded = self._recorded[0] if len(self._recorded) == _REPLAY_AFTER else None
         self._recorded.append(genuine)
         self._count += 1
-        if not kinds or self._count % _EVERY:
+        if self._count % _EVERY:
             return []
         forged = [writer.pack(_lie()) for kind, writer in self._writers.items() if kind in kinds]
         return forged + ([recorded] if REPLAYED in kinds and recorded is not None else [])
