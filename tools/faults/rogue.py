@@ -16,6 +16,7 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import can
 from can.interfaces.udp_multicast.utils import pack_message
@@ -60,7 +61,7 @@ def _ros2(domain: str) -> Iterator[Callable[[], None]]:
     """The bridge stops at the appearance of a second publisher: it appears only with the first command."""
     with contextlib.closing(Bus(DdsConfig(int(domain), "lo", ("127.0.0.1",)))) as bus:
         twist = Twist_(Vector3_(_SPEED_MPS, 0.0, 0.0), Vector3_(0.0, 0.0, 0.0))
-        writers = []
+        writers: list[Any] = []
 
         def send() -> None:
             if not writers:
