@@ -76,6 +76,7 @@ def _ros2(domain: str) -> Iterator[Callable[[], None]]:
 def _can(group: str) -> Iterator[Callable[[], None]]:
     """A socket of its own, whose port tells the sniffer the two controllers apart."""
     encoder = Encoder()
+    encoder.encode("VelocityCommand", Vx=_SPEED_MPS, Wz=0.0)  # reads the DBC file now, not at the first command
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("127.0.0.1"))
         sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
