@@ -18,6 +18,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import can
 from can.interfaces.udp_multicast.utils import pack_message
@@ -64,7 +65,7 @@ def _ros2(domain: str) -> Iterator[Callable[[], None]]:
     """The bridge stops at the appearance of a second publisher: it appears only with the first command."""
     with contextlib.closing(Bus(DdsConfig(int(domain), "lo", ("127.0.0.1",)))) as bus:
         twist = Twist_(Vector3_(_SPEED_MPS, 0.0, 0.0), Vector3_(0.0, 0.0, 0.0))
-        writers = []
+        writers: list[Any] = []
 
         def send() -> None:
             if not writers:
@@ -79,6 +80,7 @@ def _ros2(domain: str) -> Iterator[Callable[[], None]]:
 def _can(group: str) -> Iterator[Callable[[], None]]:
     """A socket of its own, whose port tells the sniffer the two controllers apart."""
     encoder = Encoder()
+    encoder.encode("VelocityCommand", Vx=_SPEED_MPS, Wz=0.0)  # reads the DBC file now, not at the first command
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("127.0.0.1"))
         sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)

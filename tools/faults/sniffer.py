@@ -15,11 +15,9 @@ import json
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any
-
-import cantools
 
 from edge.core.cli import command_line, open_stream
 from firmware_bridge.can.multicast import LoopbackMulticastBus
@@ -28,9 +26,9 @@ from firmware_bridge.dds.bus import Bus, take_each
 from firmware_bridge.ros2.messages.common import Twist_
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.messages.idl import Request_
+from sim_hil.protocols.can import frames
 from sim_hil.protocols.ros2.topics import COMMAND_TOPIC
 from sim_hil.protocols.unitree.services.sport import parse_move
-from sim_hil.realtime.robots import ROBOT_FILES
 
 _WAIT_S = 0.05
 _DEPTH = 256
@@ -39,7 +37,7 @@ Heard = tuple[int, object, "tuple[float, float, float] | None"]
 """Receive time, ns, sender, velocity."""
 
 
-def _samples(domain: str, topic: str, kind: Any) -> Iterator[tuple[int, Any] | None]:
+def _samples(domain: str, topic: str, kind: Any) -> Generator[tuple[int, Any] | None, None, None]:
     """Yield each sample with its receive time, ns; None when none waits."""
     bus = Bus(DdsConfig(int(domain), "lo", ("127.0.0.1",)))
     reader = bus.reader(topic, kind, depth=_DEPTH, reliable=True)
@@ -57,7 +55,7 @@ def _samples(domain: str, topic: str, kind: Any) -> Iterator[tuple[int, Any] | N
         bus.close()
 
 
-def _unitree(domain: str) -> Iterator[Heard | None]:
+def _unitree(domain: str) -> Generator[Heard | None, None, None]:
     for found in _samples(domain, ids.request_topic(ids.SPORT_SERVICE), Request_):
         if found is None:
             yield None
@@ -67,7 +65,7 @@ def _unitree(domain: str) -> Iterator[Heard | None]:
         yield t_ns, sample.sample_info.publication_handle, move
 
 
-def _ros2(domain: str) -> Iterator[Heard | None]:
+def _ros2(domain: str) -> Generator[Heard | None, None, None]:
     for found in _samples(domain, COMMAND_TOPIC, Twist_):
         if found is None:
             yield None
@@ -76,8 +74,8 @@ def _ros2(domain: str) -> Iterator[Heard | None]:
         yield t_ns, sample.sample_info.publication_handle, (sample.linear.x, sample.linear.y, sample.angular.z)
 
 
-def _can(group: str) -> Iterator[Heard | None]:
-    command = cantools.database.load_file(ROBOT_FILES / "carter.dbc").get_message_by_name("VelocityCommand")
+def _can(group: str) -> Generator[Heard | None, None, None]:
+    command = frames.database().get_message_by_name("VelocityCommand")
     bus = LoopbackMulticastBus(group)
     try:
         yield None
@@ -87,13 +85,17 @@ def _can(group: str) -> Iterator[Heard | None]:
             if message is None:
                 yield None
             elif message.arbitration_id == command.frame_id and not message.is_error_frame:
-                signals = command.decode(message.data)
+                signals: Any = command.decode(bytes(message.data))
                 yield t_ns, port, (float(signals["Vx"]), 0.0, float(signals["Wz"]))
     finally:
         bus.shutdown()
 
 
-LISTENERS: dict[str, Callable[[str], Iterator[Heard | None]]] = {"unitree": _unitree, "ros2": _ros2, "can": _can}
+LISTENERS: dict[str, Callable[[str], Generator[Heard | None, None, None]]] = {
+    "unitree": _unitree,
+    "ros2": _ros2,
+    "can": _can,
+}
 
 
 @command_line("sniffer")

@@ -9,9 +9,6 @@ from sim_hil.realtime.robots import StackRobot
 from tools.faults.rig import Rig
 from tools.faults.rows.row import Judge, Row, clear, own_stop_ms, robot_fault
 
-BUS_OFF_MS = 100
-INVALID_MS = 160
-"""Bound on the stop after invalid frames, ms: five frames of 20 ms, one before them, and two periods of the bridge."""
 TAKEOVER_MS = 100
 """Bound on the stop after a pilot's switch, ms: a heartbeat at once and one period of the bridge."""
 BABBLE_HZ = 3650.0
@@ -57,11 +54,17 @@ def _can(own_ms: float) -> tuple[tuple[Row, ...], tuple[Row, ...]]:
         _degraded("30 % lost", own_ms, drop=0.3),
         _degraded("every frame twice", own_ms, duplicate=1.0),
         _degraded("every 20th frame corrupted", own_ms, corrupt=0.05),
-        _degraded("babbling node, 95 % of the bus", own_ms, babble_hz=BABBLE_HZ),
+        replace(_degraded("babbling node, 95 % of the bus", own_ms, babble_hz=BABBLE_HZ), fault="can-bus-overloaded"),
     )
     return live, (
-        replace(_degraded("every frame corrupted", INVALID_MS, corrupt=1.0), judge=Judge.ZERO, starts_anew=True),
-        replace(Row("bus-off", "robot-link-down", Rig.bus_off, Rig.bus_restarted), bound=BUS_OFF_MS, ends_run=True),
+        replace(
+            _degraded("every frame corrupted", own_ms, corrupt=1.0),
+            fault="can-frames-invalid",
+            judge=None,
+            bound=None,
+            starts_anew=True,
+        ),
+        Row("bus-off", "can-bus-off", Rig.bus_off, Rig.bus_restarted),
         replace(
             _degraded("babbling node, the whole bus", own_ms, babble_hz=_ALL_HZ), judge=Judge.ROBOT, starts_anew=True
         ),
