@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from sim_hil.realtime.robots import StackRobot
-from tools.faults.rig import Rig
+from tools.faults.rig.processes import Rig
 from tools.faults.rows.row import Judge, Row, clear, own_stop_ms, robot_fault
 
 BABBLE_HZ = 3650.0
