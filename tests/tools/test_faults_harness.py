@@ -19,12 +19,12 @@ from sim_hil.protocols.mavlink.parameters import TABLE
 from sim_hil.protocols.ros2.front_end import BASE_TIMEOUT_S
 from sim_hil.realtime.robots import ROBOTS, StackRobot
 from tools.faults import __main__ as command
-from tools.faults import circle
 from tools.faults.measure import Sample
-from tools.faults.received import ReceivedCommands, first_lasting, longest_age_ms, longest_gap_ms
 from tools.faults.report import RowResult, markdown, read_results, result
+from tools.faults.rig import circle
+from tools.faults.rig.received import ReceivedCommands, first_lasting, longest_age_ms, longest_gap_ms
+from tools.faults.rig.switches import Switches
 from tools.faults.rows import CONTRACT, NOT_INJECTED, Judge, Row, rows
-from tools.faults.switches import Switches
 
 MS = 1_000_000
 ZERO, SLOW, FAST = (0.0, 0.0, 0.0), (0.3, 0.0, 0.2), (0.7, 0.0, 0.7)

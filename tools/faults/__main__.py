@@ -39,7 +39,7 @@ from sim_hil.realtime.stack import socket_dir
 from tools.faults.host_stall import HostStall
 from tools.faults.measure import Sample, injection
 from tools.faults.report import RowResult, markdown, read_results, result, show
-from tools.faults.rig import Rig
+from tools.faults.rig.processes import Rig
 from tools.faults.rows import CONTRACT, Judge, Row, rows
 from tools.report.machine import machine_facts
 

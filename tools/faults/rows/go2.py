@@ -6,7 +6,7 @@ import signal
 import time
 from dataclasses import replace
 
-from tools.faults.rig import Rig
+from tools.faults.rig.processes import Rig
 from tools.faults.rows.row import BRIDGE_STOP_MS, SCENE_MS, Judge, Row, clear, harmless, robot_fault
 
 _BETWEEN_JUMPS_S = 5.0

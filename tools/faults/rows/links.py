@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from sim_hil.protocols.mavlink import forger
 from sim_hil.realtime.robots import StackRobot
-from tools.faults.rig import Rig
+from tools.faults.rig.processes import Rig
 from tools.faults.rows.row import Judge, Row, clear, own_stop_ms, robot_fault
 
 TAKEOVER_MS = 100

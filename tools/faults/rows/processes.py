@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from sim_hil.realtime.robots import GO2, StackRobot
-from tools.faults.rig import Rig
+from tools.faults.rig.processes import Rig
 from tools.faults.rows.row import Judge, Row, clear, own_stop_ms
 
 _INSIDE_S = 30.0

@@ -9,7 +9,7 @@ from enum import Enum
 from edge.safety.faults.table import FAULTS, Action
 from sim_hil.protocols.fault_socket import TIMEOUT_S
 from sim_hil.realtime.robots import StackRobot
-from tools.faults.rig import Rig
+from tools.faults.rig.processes import Rig
 
 BRIDGE_STOP_MS = 300
 """Bound on the stop after SIGTERM to the bridge or the runner, ms: as after a dead runner."""
@@ -62,7 +62,7 @@ class Row:
     starts_anew: bool = False
     """Whether a new runner is started afterwards, whether or not the old one has stopped for good."""
     by_bridge: bool = False
-    """Whether bridge and robot alone react, so that a stand-in for the runner may drive (`tools/faults/driver.py`)."""
+    """Whether bridge and robot alone react, so that the runner's stand-in may drive (`tools/faults/rig/driver.py`)."""
     thaw: bool = False
     """Whether to send SIGCONT to the runner afterwards, which must not move the robot."""
 

@@ -1,8 +1,8 @@
 """Sniffer: a process on the robot's side that stamps every motion request on arrival.
 
-    python -m tools.faults.sniffer unitree 7 --out received.jsonl
-    python -m tools.faults.sniffer ros2 7 --out received.jsonl
-    python -m tools.faults.sniffer can 239.74.163.2 --out received.jsonl
+    python -m tools.faults.rig.sniffer unitree 7 --out received.jsonl
+    python -m tools.faults.rig.sniffer ros2 7 --out received.jsonl
+    python -m tools.faults.rig.sniffer can 239.74.163.2 --out received.jsonl
 
 One JSON object a line: {"t_ns": monotonic, "source": writer's number, "velocity": [x, y, wz] of a motion request, or
 null}. It shares only the bus and the parser of one message with the tested code.

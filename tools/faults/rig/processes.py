@@ -37,8 +37,8 @@ from sim_hil.realtime.robots import (
 from sim_hil.realtime.stack import COMMANDS, READY_LINE
 from sim_hil.realtime.truth import LineTail
 from tools.demo import INSTRUCTION
-from tools.faults.circle import SPEED_MPS
-from tools.faults.received import ReceivedCommands
+from tools.faults.rig.circle import SPEED_MPS
+from tools.faults.rig.received import ReceivedCommands
 
 READY_TIMEOUT_S = 90.0
 MOVING_TIMEOUT_S = 60.0
@@ -128,7 +128,7 @@ class Rig:
         self.hil = self._children.start("edge-hil", [*COMMANDS["edge-hil"], *scene, *where])
         waited = [(self.hil, READY_LINE)]
         if self._sniffs:
-            sniffer = [sys.executable, "-m", "tools.faults.sniffer", self.stack_robot.protocol, self._bus]
+            sniffer = [sys.executable, "-m", "tools.faults.rig.sniffer", self.stack_robot.protocol, self._bus]
             child = self._children.start("sniffer", [*sniffer, "--out", str(self.folder / "received.jsonl")])
             waited.append((child, "sniffer: ready"))
         for child, line in waited:
@@ -147,11 +147,11 @@ class Rig:
         self._runs += 1
         self._is_stand_in = self.stand_in
         if self.stand_in:
-            command = [sys.executable, "-m", "tools.faults.driver", *self._link()]
+            command = [sys.executable, "-m", "tools.faults.rig.driver", *self._link()]
             self.runner = self._children.start(f"driver-{self._runs}", command)
             return
         socket = self.folder / f"r{self._runs}.faults"
-        command = [sys.executable, "-m", "tools.faults.faulty_runner", str(socket), *self._link()]
+        command = [sys.executable, "-m", "tools.faults.rig.faulty_runner", str(socket), *self._link()]
         command += ["--artifacts", str(self._artifacts), "--instruction", INSTRUCTION]
         if self._record:
             command += ["--record", str(self.folder / f"flight{self._runs}.mcap")]
@@ -246,7 +246,7 @@ class Rig:
 
     def rogue(self, duration_s: float) -> int:
         """Let a second commander drive for `duration_s` or slightly longer; returns its start, ns."""
-        command = [sys.executable, "-m", "tools.faults.rogue", self.stack_robot.protocol, self._bus]
+        command = [sys.executable, "-m", "tools.faults.rig.rogue", self.stack_robot.protocol, self._bus]
         rogue = self._children.start("rogue", [*command, "--duration", str(duration_s)])
         try:
             self._wait(lambda: "ready" in rogue.log.read_text(), 30.0, rogue, "robot to command")

@@ -1,9 +1,9 @@
 """Second commander: drives the robot beside the bridge, like another program or the manufacturer's app.
 
-    python -m tools.faults.rogue unitree 7 --duration 1
-    python -m tools.faults.rogue can 239.74.163.2
-    python -m tools.faults.rogue ros2 7
-    python -m tools.faults.rogue mavlink 14580,/tmp/mavlink.key
+    python -m tools.faults.rig.rogue unitree 7 --duration 1
+    python -m tools.faults.rig.rogue can 239.74.163.2
+    python -m tools.faults.rig.rogue ros2 7
+    python -m tools.faults.rig.rogue mavlink 14580,/tmp/mavlink.key
 
 Finds the robot, waits for SIGUSR1, prints the monotonic ns at which it begins, and sends until the time is over.
 """

@@ -1,6 +1,6 @@
 """Stand-in for edge-run where only bridge, link and robot react: it drives the circle without camera and model.
 
-    python -m tools.faults.driver --robot FILE.toml
+    python -m tools.faults.rig.driver --robot FILE.toml
 
 It arms, sends ten commands a second from the robot's newest pose, and ends with exit code 1 when the bridge has stopped
 the robot or is gone. It starts in a fraction of edge-run's time, so that an injection takes about two seconds.
@@ -19,7 +19,7 @@ from edge.run.robot_reader import RobotReader
 from firmware_bridge.client import BridgeClient, BridgeUnavailable
 from firmware_bridge.core.config import RobotConfig, load_robot_config
 from firmware_bridge.state_client import StateReader
-from tools.faults.circle import steering
+from tools.faults.rig.circle import steering
 
 _PERIOD_NS: Final = 100_000_000
 _ARM_AGAIN_TICKS: Final = 10
