@@ -47,7 +47,10 @@ def test_a_wheeled_base_is_stopped_within_the_rows_bound(
     robot: str, names: tuple[str, ...], artifacts_dir: Path, host: HostStall
 ) -> None:
     of = {row.name: row for row in rows(ROBOTS[robot])}
-    with socket_dir() as folder, Rig(folder, artifacts_dir, None, print, stack_robot=ROBOTS[robot]) as rig:
+    with (
+        socket_dir() as folder,
+        Rig(folder, artifacts_dir, None, print, record=False, stack_robot=ROBOTS[robot]) as rig,
+    ):
         rig.start()
         for name in names:
             result = run_row(rig, of[name], 1, random.Random(name), host)
@@ -80,4 +83,32 @@ def rig(artifacts_dir: Path, dds_domain: int, host: HostStall) -> Iterator[Rig]:
 )
 def test_the_robot_is_stopped_within_the_rows_bound(name: str, rig: Rig, host: HostStall) -> None:
     result = run_row(rig, ROWS[name], 1, random.Random(name), host)
+    assert not result.problems, result.as_json()
+
+
+@pytest.fixture(scope="module")
+def rover(artifacts_dir: Path, host: HostStall) -> Iterator[Rig]:
+    with (
+        socket_dir() as folder,
+        Rig(folder, artifacts_dir, None, print, record=False, stack_robot=ROBOTS["carter-mavlink"]) as rig,
+    ):
+        rig.start()
+        yield rig
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    [
+        "unsigned packets",
+        "packets with another key",
+        "recorded packets again",
+        "packets of another system",
+        "pilot's mode switch",
+        "second commander",
+    ],
+)
+def test_a_rover_on_a_signed_link_keeps_the_rows_bound(name: str, rover: Rig, host: HostStall) -> None:
+    (row,) = [row for row in rows(rover.stack_robot) if row.name == name]
+    result = run_row(rover, row, 1, random.Random(name), host)
     assert not result.problems, result.as_json()
