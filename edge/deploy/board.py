@@ -16,10 +16,8 @@ import platform
 import re
 import subprocess
 import sys
-import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from email.parser import Parser
 from pathlib import Path
 from typing import Any, Final
 
@@ -33,7 +31,7 @@ from edge.core.cli import (
     check_result_target,
     write_result,
 )
-from edge.deploy.pins import PinsError, pinned_steps, pins_of
+from edge.deploy.pins import PinsError, pinned_steps, pins_of, wheel_extras
 from edge.deploy.releases import (
     CommandError,
     Contents,
@@ -348,22 +346,6 @@ def _existing(option: str, path: Path, is_right: Callable[[Path], bool]) -> str:
     if not is_right(path):
         raise InputError(f"{option} {path}: expected a {'folder' if is_right is Path.is_dir else 'file'}, found none")
     return os.path.realpath(path)
-
-
-def wheel_extras(wheel: Path) -> frozenset[str]:
-    """Return the extras of this package's wheel. Raises InputError for another file, or for a part of one."""
-    try:
-        with open_regular(wheel) as file, zipfile.ZipFile(file) as archive:
-            broken = archive.testzip()
-            names = [name for name in archive.namelist() if name.endswith(".dist-info/METADATA")]
-            if broken is not None or not names:
-                raise InputError(f"{wheel}: not a whole wheel ({broken or 'no METADATA'}); copy it again")
-            metadata = Parser().parsestr(archive.read(names[0]).decode())
-    except (zipfile.BadZipFile, EOFError) as error:
-        raise InputError(f"{wheel}: not a whole wheel ({error}); copy it again") from error
-    if metadata["Name"] != "tic-vla-edge":
-        raise InputError(f"{wheel}: expected a wheel of tic-vla-edge, found {metadata['Name']}")
-    return frozenset(metadata.get_all("Provides-Extra") or ())
 
 
 def _digest(path: Path) -> str:

@@ -10,6 +10,7 @@ import sys
 import zipfile
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from email.parser import Parser
 from pathlib import Path
 from typing import Final
 
@@ -25,7 +26,7 @@ _MAX_BYTES: Final = 1_000_000
 
 
 class PinsError(ValueError):
-    """Pins that cannot be read; one line."""
+    """A wheel or its pins that cannot be read; one line."""
 
 
 @dataclass(frozen=True)
@@ -105,3 +106,19 @@ def pinned_steps(
     if others:
         steps.append(command_step("install", [*pip, *others], command))
     return [*steps, command_step("check the installed packages", [*pip[:3], "check"], command)]
+
+
+def wheel_extras(wheel: Path) -> frozenset[str]:
+    """Return the extras of this package's wheel. Raises PinsError for another file, or for a part of one."""
+    try:
+        with open_regular(wheel) as file, zipfile.ZipFile(file) as archive:
+            broken = archive.testzip()
+            names = [name for name in archive.namelist() if name.endswith(".dist-info/METADATA")]
+            if broken is not None or not names:
+                raise PinsError(f"{wheel}: not a whole wheel ({broken or 'no METADATA'}); copy it again")
+            metadata = Parser().parsestr(archive.read(names[0]).decode())
+    except (zipfile.BadZipFile, EOFError) as error:
+        raise PinsError(f"{wheel}: not a whole wheel ({error}); copy it again") from error
+    if metadata["Name"] != "tic-vla-edge":
+        raise PinsError(f"{wheel}: expected a wheel of tic-vla-edge, found {metadata['Name']}")
+    return frozenset(metadata.get_all("Provides-Extra") or ())

@@ -34,6 +34,7 @@ EXAMPLES = """examples:
 A leg is one run of the stack (edge-hil, edge-bridge, edge-run) in one scene, with one task after another.
 Default budget and faults: sim_hil/soak/budget.toml and sim_hil/soak/faults.toml; copy and change them. Only the go2
 has the faults of the robot's side: other robots get those that end a process.
+A soak ends after the leg in which a budget line failed that no later leg can mend.
 exit codes: 0 budget met, 1 budget exceeded, undecided, or no leg could run, 2 bad arguments or input,
             3 refused (artifacts), 130 interrupted (a report of the finished part is written)
 """
@@ -82,6 +83,9 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--robot", choices=tuple(ROBOTS), default=GO2.name, help=f"robot to drive (default {GO2.name})")
     p.add_argument("--domain", type=int, metavar="N", help="DDS domain of a robot with DDS (default: a free one)")
     p.add_argument("--keep-logs", action="store_true", help="keep the flight logs (about 0.5 GiB an hour)")
+    p.add_argument(
+        "--to-the-end", action="store_true", help="drive on although a budget line failed that no later leg can mend"
+    )
     p.add_argument("--resume", action="store_true", help="continue the soak in --out for the remaining time")
     p.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     return p

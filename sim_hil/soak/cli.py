@@ -29,7 +29,7 @@ from sim_hil.scene.scene import SceneError
 from sim_hil.soak.arguments import UNTRAINED_MPS, check, parser
 from sim_hil.soak.faults import DEFAULT_MENU, SoakInputError, load_menu
 from sim_hil.soak.report import write_report
-from sim_hil.soak.run import SoakFolder, SoakOptions, run_legs, soak_result
+from sim_hil.soak.run import SoakFolder, SoakOptions, lost_budget, run_legs, soak_result
 from sim_hil.soak.verdict import DEFAULT_BUDGET, PASS, UNDECIDED, applicable, load_budget
 
 STATUS_PERIOD_S: Final = 30.0
@@ -58,15 +58,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
     with stop_signals() as stop:
         failure = ""
+
+        def lost() -> str | None:
+            return None if args.to_the_end else lost_budget(soak, budget)
+
         try:
             with Progress("edge-soak: ", period_s=STATUS_PERIOD_S) as progress:
                 finished = run_legs(
                     soak, options, menu, stopped=lambda: bool(stop), show_status=progress.show, log=progress.log,
-                    keep_logs=args.keep_logs,
+                    lost=lost, keep_logs=args.keep_logs,
                 )  # fmt: skip
         except (StepError, ValueError) as error:
             finished, failure = False, str(error)
-        result = soak_result(soak, options, budget, finished=finished)
+        result = soak_result(soak, options, budget, menu, finished=finished)
         write_result(str(soak.path / "result.json"), result)
         write_result(args.json, result)
         _print(str(write_report(soak, result)))
@@ -74,6 +78,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             sys.stdout.write(summary_lines(result))
     if failure:
         return _report_error(failure, EXIT_CHECK_FAILED)
+    if not finished and not stop:
+        return _report_error(f"{lost()}; drive on with --resume --to-the-end", EXIT_CHECK_FAILED)
     if not finished:
         return _report_error(f"interrupted after {soak.elapsed_s:.0f} s; continue with --resume", EXIT_INTERRUPTED)
     return exit_code(result)

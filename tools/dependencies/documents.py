@@ -68,7 +68,8 @@ def bill_of_materials(packages: Sequence[Package], version: str, extras: Sequenc
         for package in chosen
     ]
     needed = {name for package in chosen for name in package.needs}
-    dependencies = [{"ref": root, "dependsOn": sorted(ref for name, ref in references.items() if name not in needed)}]
+    top = sorted(reference for name, reference in references.items() if name not in needed)
+    dependencies = [{"ref": root, "dependsOn": top}]
     dependencies += [
         {
             "ref": references[canonicalize_name(package.name)],
