@@ -26,7 +26,7 @@ from edge.core.cli import (
 )
 from firmware_bridge.system.terminal import CommandParser
 from reporting.progress import duration
-from sim_hil.benchmark.arguments import choose
+from sim_hil.benchmark.arguments import MAX_JOBS, choose
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.conditions.latency import LatencyError, LatencyProfile, parse_latency
 from sim_hil.benchmark.language.instructions import is_held_out
@@ -108,6 +108,8 @@ def _main(args: argparse.Namespace) -> int:
     check_result_target(args.json)
     if not args.artifacts.is_dir():
         raise ConditionsError(f"--artifacts {args.artifacts}: expected a folder of exported models")
+    if not 1 <= args.jobs <= MAX_JOBS:
+        raise ConditionsError(f"--jobs: expected 1 to {MAX_JOBS}, found {args.jobs}")
     base = parse_latency(args.latency)
     rows = rows_of(args.rows)
     episodes = choose(load_suite(args.suite), args.episodes)

@@ -111,8 +111,12 @@ def check(args: argparse.Namespace) -> Recipe:
         raise TrainError("--out is missing: expected the folder of the run, e.g. --out out/run")
     check_result_directory(args.out)
     check_result_directory(args.ship, "--ship")
+    for score in args.scores:
+        if not score.is_file():
+            raise TrainError(f"--scores {score}: expected edge-bench's result.json, found no file")
     if args.command == "card":
         return recipe
+    _check_inputs(args)
     if args.scores or args.ship:
         raise TrainError("--scores and --ship belong to card")
     if args.base is not None and args.checkpoint:
@@ -124,6 +128,17 @@ def check(args: argparse.Namespace) -> Recipe:
     if args.after is not None and not args.checkpoint:
         raise TrainError("--after: expected --checkpoint with it, the weights that the step wrote")
     return recipe
+
+
+def _check_inputs(args: argparse.Namespace) -> None:
+    """Check that the named inputs exist, before the run folder is made. Raises TrainError."""
+    if args.drives is not None and not (args.drives / "dataset.json").is_file():
+        raise TrainError(f"--drives {args.drives}: expected a data set with dataset.json, found none")
+    if args.base is not None and not (args.base / "recipe.toml").is_file():
+        raise TrainError(f"--from {args.base}: not a run folder of edge-train")
+    for path in args.checkpoint:
+        if not (path.is_file() or path.is_dir()):
+            raise TrainError(f"--checkpoint {path}: expected a file or a folder of weights, found none")
 
 
 def _recipe(args: argparse.Namespace) -> Recipe:

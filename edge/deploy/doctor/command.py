@@ -182,6 +182,8 @@ def _machine(
     else:
         yield doctor_machine.match(facts, wanted, platform.machine(), available_providers(), root)
         yield doctor_machine.power_mode(facts.power_mode, root, _nvpmodel)
+        yield doctor_machine.boot_power_mode(facts.power_mode, root)
+    yield doctor_machine.hardware_watchdog(root)
     yield doctor_machine.clocks(root)
     yield doctor_machine.cpu_governor(root)
     yield doctor_machine.memory(plan, root, own_memory=facts is not None and facts.own_memory)

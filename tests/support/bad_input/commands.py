@@ -216,7 +216,7 @@ TABLE: Final = (
          "--json": outputs}, notes=2,
     ),
     _console("edge-train", "card", "card --out {folder}/run", {"--out": directories, "--scores": json_files,
-         "--ship": output_directories}),
+         "--ship": output_directories}, says=("train first", "folder of a run")),
 )  # fmt: skip
 """One row for each console script and subcommand."""
 
@@ -243,14 +243,15 @@ TOOLS: Final = (
     Command("tools.train.point_goal_export", "tools.train.point_goal_export",
          "{folder}/x.safetensors --out {folder}/x.onnx",
         {0: other_files(".safetensors"), "--out": outputs}, says=("encoder weights",)),
-    Command("tools.findings", "tools.findings.__main__", "--artifacts {folder}/models --out {folder}/findings",
-        {"--artifacts": directories, "--out": output_directories, "--rows": texts("nope", "\x1b[2J"),
+    Command("tools.findings", "tools.findings.__main__", "--artifacts {folder} --dry-run --out {folder}/findings",
+        {"--artifacts": texts("/nope", "/dev/null", "/dev/null/x"), "--rows": texts("nope", "\x1b[2J"),
          "--suite": toml_files,
          "--latency": numbers("-1"), "--jobs": numbers("-1", "0"), "--json": outputs}),
     Command("tools.findings.models", "tools.findings.models", "--run {folder}/run --out {folder}/models",
-        {"--run": directories, "--ablations": directories, "--out": output_directories}),
+        {"--run": directories, "--ablations": directories, "--out": output_directories},
+        says=("no run of edge-train",)),
     Command("tools.board", "tools.board.__main__",
-         "--root {folder}/root --artifacts {artifacts} --flight {folder}/x.mcap --out {folder}/board",
+         "--root /dev/null/root --artifacts {artifacts} --flight {folder}/x.mcap --out {folder}/board",
         {"--flight": other_files(".mcap"), "--artifacts": directories, "--out": output_directories,
          "--replay-to": seconds, "--domain": numbers("-1", "233")}),
 )  # fmt: skip
