@@ -16,7 +16,7 @@ from firmware_bridge.core.config import MavlinkConfig
 from firmware_bridge.core.step_types import Identify, Move, Report, Request, Stand
 from firmware_bridge.mavlink import modes, stations
 from firmware_bridge.mavlink.clock import VehicleClock
-from firmware_bridge.mavlink.commands import CommandQueue
+from firmware_bridge.mavlink.commands import ACCEPTED, IN_PROGRESS, CommandQueue
 from firmware_bridge.mavlink.failsafes import FailsafeCheck
 from firmware_bridge.mavlink.mode_watch import ModeWatch
 from firmware_bridge.mavlink.odometry import ERROR_NAMES, OdometryInput
@@ -119,7 +119,10 @@ class Session:
             command = getattr(message, "command", 0)
             target = getattr(message, "target_system", getattr(message, "target", 0))  # MANUAL_CONTROL: `target`
             if target in (0, self._config.system):
-                self._foreign = stations.foreign_message(number, command, sender) or self._foreign
+                foreign = stations.foreign_message(number, command, sender)
+                self._foreign = foreign or self._foreign
+                if foreign is not None and number in stations.COMMAND_MESSAGES:
+                    self._give_way()  # whether the autopilot obeys is not known: a person's mode must stay
         elif sender != (self._config.system, AUTOPILOT):
             # Heartbeats of ground stations that watch are welcome; every other value must be the autopilot's.
             self.reader.counts.strange += number != 0
@@ -140,6 +143,11 @@ class Session:
         if self.watch.yielded:
             self.commands.cancel(SET_MODE, ARM_DISARM)
 
+    def _give_way(self) -> None:
+        """Request no mode until the next arming: another station has commanded the rover."""
+        self.watch.give_way()
+        self.commands.cancel(SET_MODE, ARM_DISARM)
+
     def _parameter(self, message: Message, now_ns: int) -> None:
         name = message.param_id.split("\0")[0]
         self.failsafes.value(name, message.param_value, message.param_type)
@@ -151,6 +159,8 @@ class Session:
         foreign = stations.foreign_acknowledgement(command, target, own, requested)
         if foreign is not None:
             self._foreign = foreign
+            if message.result in (ACCEPTED, IN_PROGRESS):
+                self._give_way()  # the heartbeat with another station's mode may come later than this
         if target not in (own, (0, 0)) or foreign is not None:
             return
         waited = self.commands.waits(command)

@@ -15,7 +15,7 @@ from edge.flightlog.recorder import space_refusal
 from sim_hil.realtime.stack import socket_dir
 from tools.faults.__main__ import run_row
 from tools.faults.host_stall import HostStall
-from tools.faults.rig import Rig
+from tools.faults.rig.processes import Rig
 from tools.faults.rows import rows
 
 pytestmark = pytest.mark.process

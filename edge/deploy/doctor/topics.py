@@ -43,12 +43,16 @@ class TopicUse:
 
 @dataclass(frozen=True)
 class Endpoint:
-    """A publisher or subscriber of another program, as discovery announces it; `type_name`: the DDS type."""
+    """A publisher or subscriber of another program, as discovery announces it.
+
+    `type_name`: the DDS type. `participant`: number of the program that it belongs to.
+    """
 
     topic: str
     type_name: str
     publishes: bool
     reliable: bool
+    participant: str = ""
 
 
 @dataclass(frozen=True)
@@ -87,7 +91,10 @@ def judge(use: TopicUse, survey: Survey) -> Check:
     name, shown = f"topic {use.topic.removeprefix('rt')}", use.message.replace("/msg/", "/")
     role = "subscriber" if use.commands else "publisher"
     expected = f"a {role} of {shown}"
-    there = [end for end in survey.endpoints if end.topic == use.topic and end.publishes != use.commands]
+    of_topic = [end for end in survey.endpoints if end.topic == use.topic]
+    # A program that publishes commands and reads them looks for a second commander: the bridge.
+    watching = {end.participant for end in of_topic if end.publishes} if use.commands else set()
+    there = [end for end in of_topic if end.publishes != use.commands and end.participant not in watching]
     fitting = [end for end in there if end.type_name == dds_type(use.message)]
     # A reliable subscriber needs a reliable publisher; every other pair matches.
     if use.commands:
@@ -200,7 +207,8 @@ class _Endpoints:
                     self._found.pop(key, None)
                 elif str(sample.participant_key) != self._own and sample.topic_name in self._topics:
                     reliable = isinstance(sample.qos[Policy.Reliability], Policy.Reliability.Reliable)
-                    self._found[key] = Endpoint(sample.topic_name, sample.type_name, publishes, reliable)
+                    program = str(sample.participant_key)
+                    self._found[key] = Endpoint(sample.topic_name, sample.type_name, publishes, reliable, program)
 
     def found(self) -> list[Endpoint]:
         """Return the endpoints that are there now."""

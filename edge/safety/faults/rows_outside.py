@@ -147,6 +147,25 @@ BRIDGE: tuple[Fault, ...] = (
         "tests/firmware_bridge/test_bridge_dangers.py::TestEveryDanger::test_it_stops_a_driven_robot_in_the_same_step",
     ),
     Fault(
+        "can-bus-off", 43, Action.STOP, 100, "bridge",
+        "The CAN controller is bus-off or error-passive: its error frames say so.",
+        "Check wiring, termination and bit rate, then arm again.",
+        "tests/firmware_bridge/can/test_can_supervision.py::"
+        "test_an_error_frame_of_a_controller_in_trouble_stops_it_in_the_next_step",
+    ),
+    Fault(
+        "can-frames-invalid", 44, Action.STOP, 160, "bridge",
+        "Five frames of a CAN message in a row had a wrong CRC, counter or length.",
+        "Check wiring and DBC file: edge-bridge status names the message; then arm again.",
+        "tests/firmware_bridge/can/test_can_supervision.py::test_five_wrong_crcs_in_a_row_stop_the_robot_within_100_ms",
+    ),
+    Fault(
+        "can-bus-overloaded", 45, Action.NOTHING, 0, "bridge",
+        "The load of the CAN bus is above 80 %: commands may be late, and a base without commands stops by itself.",
+        "Find the node that sends: the bridge's log names the most frequent unknown identifier.",
+        "tests/firmware_bridge/can/test_can_supervision.py::test_a_babbling_node_is_named_to_the_operator",
+    ),
+    Fault(
         "robot-link-down", 46, Action.STOP, 100, "bridge",
         "Commands cannot be sent: the network to the robot is down or its queue is full.",
         "Check the interface or device that the robot file names; edge-doctor says what is missing.",

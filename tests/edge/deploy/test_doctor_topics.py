@@ -36,7 +36,12 @@ CAMERA = TopicUse("camera.source", "rt/image", "sensor_msgs/msg/CompressedImage"
 
 def end_of(use: TopicUse, message: str = "", *, reliable: bool = True) -> Endpoint:
     """The endpoint of another node that fits a use, with changes."""
-    return Endpoint(use.topic, dds_type(message or use.message), not use.commands, reliable)
+    return Endpoint(use.topic, dds_type(message or use.message), not use.commands, reliable, "base")
+
+
+def watcher(use: TopicUse) -> list[Endpoint]:
+    """The endpoints of a program that publishes on a topic and reads what others publish there."""
+    return [replace(end_of(use), publishes=publishes, participant="bridge") for publishes in (True, False)]
 
 
 def robot(domain: int = 0, **changes: Any) -> RobotConfig:
@@ -69,7 +74,8 @@ def robot(domain: int = 0, **changes: Any) -> RobotConfig:
         ),
         (COMMAND, [end_of(COMMAND)], 0.0, Level.OK, "1 subscriber"),
         (COMMAND, [], 0.0, Level.FAIL, "no subscriber of any type"),
-        (COMMAND, [replace(end_of(COMMAND), publishes=True)], 0.0, Level.FAIL, "no subscriber of any type"),
+        (COMMAND, watcher(COMMAND), 0.0, Level.FAIL, "no subscriber of any type"),
+        (COMMAND, [end_of(COMMAND), *watcher(COMMAND)], 0.0, Level.OK, "1 subscriber"),
         (COMMAND, [end_of(COMMAND, "geometry_msgs/msg/TwistStamped")], 0.0, Level.FAIL, "correct ros2.stamped"),
         (replace(COMMAND, reliable=False), [end_of(COMMAND, reliable=False)], 0.0, Level.OK, "1 subscriber"),
         (

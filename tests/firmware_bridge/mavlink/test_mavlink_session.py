@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import common
 from firmware_bridge.mavlink.session import ARM_DISARM, SET_MODE
 from sim_hil.protocols.mavlink.autopilots import ARDUPILOT
 from sim_hil.protocols.mavlink.vehicle import Mode
-from tests.support.robot.rover_bench import MS, ROBOTS, RoverBench, command, lost, robot_file
+from tests.support.robot.rover_bench import MS, ROBOTS, RoverBench, command, lost, robot_file, whole
 
 KEY, OTHER_KEY = bytes(range(32)), bytes(32)
 AUTOPILOTS = {
@@ -148,6 +148,30 @@ class TestTakeover:
         bench.run(3.0)
         assert not any(vx for at, vx in setpoints(bench, since_ns + 20 * MS))
         assert bench.mode is mode and bench.status is not None and bench.status.state == "stopped"
+
+    def test_the_bridge_leaves_a_ground_stations_mode_alone_also_when_the_acknowledgement_comes_first(self) -> None:
+        bench = driving()
+        since_ns = bench.now_ns
+        bench.to_bridge = lambda packet: () if packet[7:10] == b"\0\0\0" else (packet,)  # no heartbeat
+        bench.ground(command(SET_MODE, 1, 1, 0))
+        bench.run(1.0)
+        bench.to_bridge = whole
+        bench.run(1.0)
+        assert bench.mode is Mode.MANUAL and not bench.commands(SET_MODE, since_ns)
+
+    @pytest.mark.parametrize("name", ["mode", "arming", "mission"])
+    def test_the_bridge_requests_no_mode_after_another_stations_command(self, name: str) -> None:
+        bench = driving()
+        since_ns = bench.now_ns
+        bench.arrive(bench.pack(FOREIGN[name], system=255, component=190))
+        bench.run(3.0)
+        assert not bench.commands(SET_MODE, since_ns)
+
+    def test_a_denied_command_of_another_station_leaves_the_rover_in_hold(self) -> None:
+        bench = driving()
+        bench.ground(command(ARM_DISARM, 0))
+        bench.run(1.0)
+        assert bench.mode is Mode.HOLD
 
     def test_after_a_ground_stations_hold_a_new_arming_drives_again(self) -> None:
         bench = driving()
