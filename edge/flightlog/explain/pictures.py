@@ -9,10 +9,10 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
+from edge.flightlog.explain.chain import generation_of
 from edge.flightlog.explain.explanation import Explanation
 from edge.flightlog.explain.flight import Flight
 from edge.flightlog.explain.overlay import Overlay, Picture, label
-from edge.flightlog.explain.verdict import generation_of
 from edge.flightlog.replay.records import RecordedFrame, read_events
 
 CARD_PX: Final = 480
