@@ -144,7 +144,9 @@ def _older(directory: Path, manifest: Mapping[str, Any]) -> str:
     asked = asked.get("asked") if isinstance(asked, dict) else None
     named = [(key, asked.get(key) if isinstance(asked, dict) else None) for key in ("target", "model")]
     options = [f"--{key} {name} " for key, name in named if isinstance(name, str) and _PLAIN_NAME.fullmatch(name)]
-    return f"an older release wrote it, without a self-test: edge-export {''.join(options)}--out {directory}"
+    return (
+        f"an older release wrote it, without a self-test; export again: edge-export {''.join(options)}--out {directory}"
+    )
 
 
 def check_entry(name: str, entry: Any) -> None:

@@ -23,7 +23,7 @@ from edge.artifacts.files import (
 )
 from edge.artifacts.known_answers import KnownAnswers, read_known_answers
 from edge.artifacts.providers import wrong_option
-from edge.artifacts.runtime import SPECIAL_TOKENS, RuntimeConfig, check_agreement, read_runtime
+from edge.artifacts.runtime import SPECIAL_TOKENS, RuntimeConfig, check_agreement, nested, read_runtime
 from edge.artifacts.tokenizer_file import TokenizerFileError, check_tokenizer_file
 from edge.artifacts.trust import Trust
 from edge.state.reasoning_text import WAYPOINT_TIMES_S
@@ -170,8 +170,8 @@ def load_artifacts(directory: Path, trust: Trust | None = None) -> Artifacts:
     if surplus:
         raise ArtifactError(f"{MANIFEST_NAME}: graph {surplus[0]!r} is unknown to the runner")
     runtime = read_runtime(_section(manifest, "runtime"))
-    _check_tokenizer(contents, runtime)
     model = _section(manifest, "model")
+    _check_tokenizer(contents, runtime, nested(model, "config", "language", "vocab"))
     artifacts = Artifacts(
         directory=directory,
         manifest_sha256=str(manifest[SEAL]),
@@ -193,13 +193,18 @@ def load_artifacts(directory: Path, trust: Trust | None = None) -> Artifacts:
     return artifacts
 
 
-def _check_tokenizer(contents: Mapping[str, bytes], runtime: RuntimeConfig) -> None:
-    """Check the tokenizer and that the special tokens' ids are its own; raises ArtifactError."""
+def _check_tokenizer(contents: Mapping[str, bytes], runtime: RuntimeConfig, vocabulary: Any) -> None:
+    """Check the tokenizer, its special tokens' ids and the size of its vocabulary; raises ArtifactError.
+
+    `vocabulary`: number of tokens of the network; None if the manifest does not record it.
+    """
     if "tokenizer.json" not in contents:
         raise ArtifactError(f"{MANIFEST_NAME}: tokenizer.json is missing from the files")
     special = {token: int(getattr(runtime, name)) for name, token in SPECIAL_TOKENS.items()}
     try:
-        check_tokenizer_file(contents["tokenizer.json"], special)
+        size = check_tokenizer_file(contents["tokenizer.json"], special)
+        if isinstance(vocabulary, int) and size > vocabulary:
+            raise TokenizerFileError(f"has the token id {size - 1}, the network's vocabulary ends at {vocabulary - 1}")
     except TokenizerFileError as error:
         raise ArtifactError(f"tokenizer.json: {error}; export again") from error
 

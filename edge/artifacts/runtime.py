@@ -134,23 +134,23 @@ def check_agreement(manifest: Mapping[str, Any], runtime: RuntimeConfig, steps: 
 
     `steps`: length of the action expert's trajectory. Raises ArtifactError.
     """
-    network = _path(manifest, "model", "config")
+    network = nested(manifest, "model", "config")
     for name, (section, key) in _TRAINED.items():
-        trained = _path(network, section, key) if network is not None else None
+        trained = nested(network, section, key) if network is not None else None
         value = getattr(runtime, name)
         _require(trained in (None, value), f"{name} is {value}, the network was built for {trained}")
-    trained = None if network is None else _path(network, "action", "steps")
+    trained = None if network is None else nested(network, "action", "steps")
     _require(trained in (None, steps), f"the trajectory has {steps} steps, the network was built for {trained}")
-    period_ms = _path(manifest, "plan", "period_ms")
+    period_ms = nested(manifest, "plan", "period_ms")
     _require(period_ms in (None, runtime.tick_period_ms), f"tick_period_ms is {runtime.tick_period_ms}, the plan's is "
              f"{period_ms}")  # fmt: skip
-    cores = _path(manifest, "provenance", "target", "device", "cores")
+    cores = nested(manifest, "provenance", "target", "device", "cores")
     used = max((*runtime.control_cores, *runtime.reasoning_cores), default=0)
     if isinstance(cores, int):
         _require(used < cores, f"core {used} is used, the target has the cores 0 to {cores - 1}")
 
 
-def _path(holder: Any, *keys: str) -> Any:
+def nested(holder: Any, *keys: str) -> Any:
     """Return a nested value; None where a key is missing."""
     for key in keys:
         holder = holder.get(key) if isinstance(holder, Mapping) else None
