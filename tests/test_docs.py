@@ -33,7 +33,7 @@ TARGET = re.compile(r"^\s*make ([a-z][a-z-]*)")
 MODULE = re.compile(r"-m ((?:" + "|".join(FOLDERS) + r")(?:\.\w+)+)")
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9-]*")
 REPOSITORY_PATH = re.compile(r"(?<![\w./~-])(?:" + "|".join(FOLDERS) + r")/[\w./-]*")
-OTHER_PROGRAM = re.compile(r"(?<![\w-])(?:ray|torchrun|pip|apt-get|docker|nft|git|ls|sed) ")
+OTHER_PROGRAM = re.compile(r"(?<![\w-])(?:ray|torchrun|pip|apt-get|docker|nft|git|ls|sed|ros2 topic|ros2 param) ")
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ def test_the_readme_stays_short() -> None:
     [
         ("Where is a velocity limited?", "docs/architecture.md", "edge/motion/controller.py"),
         ("What happens when the camera freezes?", "docs/architecture.md", "camera-frozen"),
-        ("How do I add a CAN robot?", "CONTRIBUTING.md", "firmware_bridge/core/config.py"),
+        ("How do I add a CAN robot?", "docs/your_robot.md", "firmware_bridge/robots/example_can.toml"),
     ],
 )
 def test_the_readme_leads_a_newcomers_question_to_its_answer(question: str, page: str, answer: str) -> None:

@@ -111,8 +111,11 @@ class RobotConfig:
             require(given or not needed, f"missing table [{table}]; protocol {self.protocol} needs it")
             require(needed or not given, f"unexpected table [{table}]; protocol {self.protocol} does not use it")
         self.camera.check_protocol(self.protocol)
-        charge_known = self.ros2 is None or self.ros2.battery != "" or self.safety.battery_min_percent == 0
+        unasked = self.safety.battery_min_percent == 0
+        charge_known = self.ros2 is None or self.ros2.battery != "" or unasked
         require(charge_known, "missing key ros2.battery; without a battery topic write safety.battery_min_percent = 0")
+        charge_known = self.can is None or self.can.battery is not None or unasked
+        require(charge_known, "missing table [can.battery]; without one write safety.battery_min_percent = 0")
         for key, (walking, fastest) in FASTEST[self.protocol].items():
             value: float = getattr(self.limits, key)
             permitted = fastest if self.safety.above_walking_speed else walking
@@ -156,8 +159,9 @@ def load_robot_config(path: Path | str, *, socket: Path | None = None, domain: i
                 require(key not in safety, f"unknown key safety.{key}: only protocol unitree has it")
         config: RobotConfig = _build(RobotConfig, table, "")
         dds = config.dds if domain is None else replace(config.network, domain=domain)
+        can = None if config.can is None else config.can.with_files_of(Path(path).absolute().parent)
         bridge = config.bridge if socket is None else replace(config.bridge, socket=socket.absolute())
-        return replace(config, dds=dds, bridge=bridge)
+        return replace(config, dds=dds, can=can, bridge=bridge)
     except ConfigError as error:
         raise ConfigError(f"robot file {path}: {error}") from error
 

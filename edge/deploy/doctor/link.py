@@ -15,7 +15,8 @@ from edge.deploy.doctor.rights import UserRights
 from edge.deploy.link_rights import SERIAL_GROUP, serial_device
 from edge.deploy.unit_check import run_command
 from edge.deploy.units import FIREWALL_FILE, FIREWALL_FOLDER, FIREWALL_UNIT
-from firmware_bridge.core.config import RobotConfig
+from firmware_bridge.backends import INSTALL
+from firmware_bridge.core.config import ConfigError, RobotConfig
 
 Runner = Callable[[Sequence[str]], tuple[int, str]]
 
@@ -33,9 +34,11 @@ def robot_links(robot: RobotConfig, root: Path, user: UserRights, run: Runner = 
     elif device is not None:
         yield serial_line(device, root, user)
     elif robot.can is not None and robot.can.interface == "socketcan":
-        yield can_interface(robot.can.channel, root, run)
+        yield can_interface(robot.can.channel, robot.can.bitrate_bps, root, run)
     elif robot.can is not None:
         yield skipped("CAN interface", f"{robot.can.interface} is a simulated bus")
+    if robot.can is not None:
+        yield dbc_file(robot)
     if robot.mavlink is not None:
         host = "" if device is not None else robot.mavlink.link.split(":")[1]
         yield signing_key(robot.mavlink.signing_key, host, root)
@@ -77,11 +80,11 @@ def _default_routes(root: Path) -> list[str]:
     return [row[0] for row in fields if len(row) > 7 and row[1] == row[7] == "00000000"]
 
 
-def can_interface(channel: str, root: Path, run: Runner = run_command) -> Check:
-    """Whether the CAN interface is there, up and on the bus, and starts again by itself after a bus-off."""
+def can_interface(channel: str, bitrate_bps: int, root: Path, run: Runner = run_command) -> Check:
+    """Whether the CAN interface is up at the robot file's bitrate, and starts again by itself after a bus-off."""
     name, device = "CAN interface", root / "sys/class/net" / channel
-    expected = f"{channel} up, with a bitrate and restart-ms"
-    bring_up = f"sudo ip link set {channel} up type can bitrate BITRATE restart-ms 100 (BITRATE: that of the base)"
+    expected = f"{channel} up, with {bitrate_bps} bit/s and restart-ms"
+    bring_up = f"sudo ip link set {channel} up type can bitrate {bitrate_bps} restart-ms 100"
     try:
         kind, flags = (device / "type").read_text().strip(), int((device / "flags").read_text(), 16)
     except (OSError, ValueError):
@@ -99,16 +102,36 @@ def can_interface(channel: str, root: Path, run: Runner = run_command) -> Check:
     data = details.get("info_data") or {}
     bitrate, state = (data.get("bittiming") or {}).get("bitrate"), data.get("state", "unknown")
     found = f"{channel} is up, {bitrate} bit/s, {state}, restart-ms {data.get('restart_ms', 0)}"
+    again = bring_up.replace(" up ", f" down; sudo ip link set {channel} up ", 1)
+    if bitrate != bitrate_bps:
+        advice = f"the base, this interface and can.bitrate_bps need one bitrate: correct the robot file, or {again}"
+        return Check(name, Level.FAIL, found, expected, advice)
     if state == "BUS-OFF":
-        advice = "check bitrate, wiring and termination, then: " + bring_up.replace(" up ", " down; ", 1)
+        advice = f"check the base's bitrate, wiring and termination, then: {again}"
         return Check(name, Level.FAIL, found, expected, advice)
     if state == "ERROR-PASSIVE":
-        advice = "is the base on? check bitrate, wiring and termination (60 ohm between CAN_H and CAN_L)"
+        advice = "is the base on? check its bitrate, wiring and termination (60 ohm between CAN_H and CAN_L)"
         return Check(name, Level.WARN, found, expected, advice)
     if not data.get("restart_ms"):
-        advice = f"after a bus-off it stays off: sudo ip link set {channel} down; {bring_up}"
+        advice = f"after a bus-off it stays off: {again}"
         return Check(name, Level.WARN, found, expected, advice)
     return Check(name, Level.OK, found, expected)
+
+
+def dbc_file(robot: RobotConfig) -> Check:
+    """Whether the robot file and the DBC file of a CAN base fit each other, and the load that they plan."""
+    name, expected = "DBC file", "what the tables of [can] name"
+    try:
+        from firmware_bridge.can.database import load_database  # needs the extra of its protocol
+
+        database = load_database(robot)
+    except ModuleNotFoundError as error:
+        return skipped(name, f"{error.name} is missing: {INSTALL['can']}")
+    except ConfigError as error:
+        return Check(name, Level.FAIL, str(error), expected, "correct the key that the message names, or the DBC file")
+    path = robot.can.dbc_path if robot.can is not None else ""
+    counts = f"{len(database.received)} messages received, {len(database.sent)} sent"
+    return Check(name, Level.OK, f"{path}: {counts}, {database.load:.0%} of the bus", expected)
 
 
 def _can_details(channel: str, run: Runner) -> dict[str, Any] | None:
@@ -151,7 +174,7 @@ def signing_key(key: Path | None, host: str, root: Path) -> Check:
     try:
         found = file.stat()
     except OSError as error:
-        advice = "create it as docs/robot.md shows, or run this as root"
+        advice = "create it as docs/your_robot.md shows, or run this as root"
         return Check(name, Level.FAIL, f"{key}: {error.strerror}", expected, advice)
     if found.st_mode & 0o077:
         advice = f"sudo chmod 0600 {key}, and make a new key: others may have read this one"

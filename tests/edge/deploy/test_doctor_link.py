@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from edge.deploy.doctor.check import Check, Level
-from edge.deploy.doctor.link import can_interface, robot_links, serial_line, signing_key
+from edge.deploy.doctor.link import can_interface, dbc_file, robot_links, serial_line, signing_key
 from edge.deploy.doctor.rights import UserRights, current_user
 from edge.deploy.doctor.robot import bridge, robot_link
 from firmware_bridge.core.config import RobotConfig, load_robot_config
@@ -24,7 +24,8 @@ from tests.edge.deploy.test_link_rights import robot as parts_of
 from tests.edge.run.test_robot_reader import robot_with
 from tests.support.processes import GO2_SIM
 
-CAN = {"state": "ERROR-ACTIVE", "restart_ms": 100, "bittiming": {"bitrate": 500000}}
+BITRATE_BPS = 500_000
+CAN = {"state": "ERROR-ACTIVE", "restart_ms": 100, "bittiming": {"bitrate": BITRATE_BPS}}
 STRANGER = UserRights("tic-vla-bridge", 4242, frozenset({4242}), other=True)
 
 
@@ -47,33 +48,35 @@ def ip_says(info: dict[str, Any], kind: str = "can") -> Callable[[Sequence[str]]
         ({"restart_ms": 0}, Level.WARN, "restart-ms 100"),
         ({"state": "ERROR-PASSIVE"}, Level.WARN, "is the base on"),
         ({"state": "BUS-OFF"}, Level.FAIL, "termination"),
+        ({"bittiming": {"bitrate": 250000}}, Level.FAIL, "correct the robot file, or sudo ip link set can0 down"),
+        ({"bittiming": {}}, Level.FAIL, "None bit/s"),
     ],
 )
 def test_a_can_interface_is_judged_by_its_state_and_its_restart(
     tmp_path: Path, change: dict[str, Any], level: Level, text: str
 ) -> None:
-    check = can_interface("can0", machine(tmp_path), ip_says({**CAN, **change}))
+    check = can_interface("can0", BITRATE_BPS, machine(tmp_path), ip_says({**CAN, **change}))
     assert check.level is level and text in check.found + check.advice
 
 
 def test_a_can_interface_that_is_down_or_absent_names_the_command(tmp_path: Path) -> None:
-    absent = can_interface("can0", tmp_path, ip_says(CAN))
-    down = can_interface("can0", machine(tmp_path, up=False), ip_says(CAN))
+    absent = can_interface("can0", BITRATE_BPS, tmp_path, ip_says(CAN))
+    down = can_interface("can0", BITRATE_BPS, machine(tmp_path, up=False), ip_says(CAN))
     for check in (absent, down):
         assert check.level is Level.FAIL and "sudo ip link set can0 up type can bitrate" in check.advice
 
 
 def test_another_kind_of_interface_is_refused(tmp_path: Path) -> None:
-    assert can_interface("can0", machine(tmp_path, kind=1), ip_says(CAN)).level is Level.FAIL
+    assert can_interface("can0", BITRATE_BPS, machine(tmp_path, kind=1), ip_says(CAN)).level is Level.FAIL
 
 
 def test_a_virtual_can_interface_needs_no_bitrate(tmp_path: Path) -> None:
-    assert can_interface("can0", machine(tmp_path), ip_says({}, "vcan")).level is Level.OK
+    assert can_interface("can0", BITRATE_BPS, machine(tmp_path), ip_says({}, "vcan")).level is Level.OK
 
 
 @pytest.mark.parametrize("answer", [(1, "Cannot find device"), (0, "no json"), (0, "[]"), (0, '[{"linkinfo": 7}]')])
 def test_without_an_answer_of_ip_the_bitrate_is_unknown(tmp_path: Path, answer: tuple[int, str]) -> None:
-    assert can_interface("can0", machine(tmp_path), lambda _words: answer).level is Level.WARN
+    assert can_interface("can0", BITRATE_BPS, machine(tmp_path), lambda _words: answer).level is Level.WARN
 
 
 @pytest.mark.parametrize("error", [FileNotFoundError("ip"), subprocess.TimeoutExpired("ip", 60)])
@@ -81,7 +84,7 @@ def test_a_machine_without_ip_is_no_crash(tmp_path: Path, error: Exception) -> N
     def fail(_words: Sequence[str]) -> tuple[int, str]:
         raise error
 
-    assert can_interface("can0", machine(tmp_path), fail).level is Level.WARN
+    assert can_interface("can0", BITRATE_BPS, machine(tmp_path), fail).level is Level.WARN
 
 
 def test_a_serial_line_must_be_a_device_that_the_user_may_open() -> None:
@@ -114,12 +117,38 @@ def test_a_missing_key_fails_and_an_unsigned_network_is_a_warning(tmp_path: Path
     assert signing_key(None, "", tmp_path).level is Level.OK
 
 
+def can_base(interface: str = "socketcan", **changes: Any) -> RobotConfig:
+    """The example base, with changes of [can]."""
+    base = load_robot_config(GO2_SIM.with_name("example_can.toml"))
+    assert base.can is not None
+    return replace(base, can=replace(base.can, interface=interface, **changes))
+
+
+def test_a_dbc_file_that_fits_the_robot_file_shows_its_messages_and_its_load() -> None:
+    check = dbc_file(can_base())
+    assert check.level is Level.OK and "4 messages received, 3 sent" in check.found and "% of the bus" in check.found
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"dbc": Path("/nowhere/base.dbc")}, "can.dbc: /nowhere/base.dbc: expected a DBC file"),
+        ({"node": "Nobody"}, "can.node: expected a node of"),
+        ({"heartbeat": "WheelSpeed"}, "can.heartbeat: WheelSpeed: expected Computer as its sender"),
+        ({"bitrate_bps": 20_000}, "can.max_load"),
+    ],
+)
+def test_a_dbc_file_that_does_not_fit_is_named_without_a_bus(changes: dict[str, Any], text: str) -> None:
+    check = dbc_file(can_base(**changes))
+    assert check.level is Level.FAIL and text in check.found and "\n" not in check.found
+
+
 @pytest.mark.parametrize(
     ("of", "names"),
     [
-        (parts_of(can="socketcan"), ["CAN interface"]),
-        (parts_of(can="udp_multicast"), ["CAN interface"]),
-        (parts_of(can="serial", channel="/dev/ttyUSB0"), ["serial line"]),
+        (can_base("socketcan"), ["CAN interface", "DBC file"]),
+        (can_base("udp_multicast"), ["CAN interface", "DBC file"]),
+        (can_base("serial", channel="/dev/ttyUSB0"), ["serial line", "DBC file"]),
         (parts_of(mavlink="serial:/dev/ttyACM0:57600"), ["serial line", "MAVLink signing"]),
         (parts_of(mavlink="udp:10.0.0.1:14550"), ["MAVLink signing"]),
         (load_robot_config(GO2_SIM), ["robot's cable"]),

@@ -118,7 +118,8 @@ def test_an_unknown_charge_is_no_battery_report() -> None:
 @pytest.mark.parametrize(
     ("flags", "is_ekf", "good"),
     [(1 | 2 | 8, False, True), (1 | 2 | 16, True, True), (1 | 2, False, False), (2 | 8, False, False),
-     (1 | 2 | 8 | 128, False, False), (1 | 2 | 8 | 1024, True, False), (1 | 2 | 8 | 1024, False, True)],
+     (1 | 2 | 8 | 128, False, False), (1 | 2 | 8 | 1024, True, False), (1 | 2 | 8 | 1024, False, False),
+     (1 | 2 | 8 | 2048, False, False), (1 | 2 | 8 | 32768, True, False), (1 | 2 | 8 | 2048, True, True)],
 )  # fmt: skip
-def test_an_estimate_needs_attitude_velocity_and_position(flags: int, is_ekf: bool, good: bool) -> None:
+def test_an_estimate_needs_attitude_velocity_and_position_and_no_glitch(flags: int, is_ekf: bool, good: bool) -> None:
     assert is_estimate_good(flags, is_ekf=is_ekf) is good
