@@ -185,7 +185,7 @@ WRONG: list[tuple[str, list[Edit]]] = [
     ("nested deeper than 32 levels", [lambda m: m.update(plan=nested(40))]),
     ("bytes, expected at most", [lambda m: m["files"]["report.json"].update(bytes=10 << 30)]),
     ("bytes together, expected at most", [lambda m: m["files"].update({f"{n}.onnx": LARGE for n in range(5)})]),
-    ("has the shape", [lambda m: m["graphs"]["vision_encoder"]["inputs"][0].update(shape=[1, 1 << 40])]),
+    ("has a tensor of shape", [lambda m: m["graphs"]["vision_encoder"]["inputs"][0].update(shape=[1, 1 << 40])]),
     ("self_test: ", [
         lambda m: m["self_test"].pop("seed"), lambda m: m["self_test"].update(limit_s=1e9),
         lambda m: m["self_test"]["answers"].pop("chain"), lambda m: m.update(self_test=[]),
