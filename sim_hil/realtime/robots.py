@@ -156,6 +156,14 @@ CAN_BETWEEN_PROCESSES: Final = replace(
     values=(("can.interface", "udp_multicast"), ("can.channel", "{can_group}"), *ROBOTS["carter-can"].values[1:]),
 )
 """The robot on CAN with a bus that further processes can join: a sniffer, a second controller."""
+MAVLINK_KEY: Final = "mavlink.key"
+"""Name of the signing key in the folder of a run's sockets, for MAVLINK_SIGNED."""
+MAVLINK_SIGNED: Final = replace(
+    ROBOTS["carter-mavlink"],
+    hil=(f"{ROBOTS['carter-mavlink'].hil[0]},key={{folder}}/{MAVLINK_KEY}",),
+    values=(*ROBOTS["carter-mavlink"].values, ("mavlink.signing_key", f"{{folder}}/{MAVLINK_KEY}")),
+)
+"""The robot on MAVLink with a signed link."""
 
 
 def robot_of(name: str) -> StackRobot:

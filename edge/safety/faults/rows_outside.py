@@ -135,6 +135,12 @@ BRIDGE: tuple[Fault, ...] = (
         "test_a_publisher_of_motor_commands_stops_a_driven_robot",
     ),
     Fault(
+        "mavlink-forged", 41, Action.NOTHING, 0, "bridge",
+        "Unsigned, forged or recorded MAVLink packets, or packets of another system, arrived and were dropped.",
+        "Find the sender: edge-bridge counts its packets as malformed; sign the link (mavlink.signing_key).",
+        "tests/firmware_bridge/mavlink/test_mavlink_session.py::TestSigning::test_forged_packets_change_nothing",
+    ),
+    Fault(
         "robot-mode-left", 42, Action.STOP, 1000, "bridge",
         "The robot left its driving modes by itself.",
         "Check the robot: it may have fallen or been taken over; then arm again.",

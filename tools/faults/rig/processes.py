@@ -6,6 +6,7 @@ only: there the trace of edge-hil has the requests as its front end receives the
 
 from __future__ import annotations
 
+import secrets
 import signal
 import statistics
 import subprocess
@@ -24,7 +25,15 @@ from firmware_bridge.core.config import RobotConfig, load_robot_config
 from sim_hil.processes.child_process import last_lines
 from sim_hil.protocols.fault_socket import FaultClient, FaultError
 from sim_hil.realtime.children import Child, Children, StepError
-from sim_hil.realtime.robots import BRIDGE_SOCKET, CAN_BETWEEN_PROCESSES, GO2, RunAddress, StackRobot
+from sim_hil.realtime.robots import (
+    BRIDGE_SOCKET,
+    CAN_BETWEEN_PROCESSES,
+    GO2,
+    MAVLINK_KEY,
+    MAVLINK_SIGNED,
+    RunAddress,
+    StackRobot,
+)
 from sim_hil.realtime.stack import COMMANDS, READY_LINE
 from sim_hil.realtime.truth import LineTail
 from tools.demo import INSTRUCTION
@@ -63,11 +72,16 @@ class Rig:
         """
         self.folder = folder
         # A serial line has room for two processes, the bus between processes also for a sniffer and a second commander.
-        self.stack_robot = CAN_BETWEEN_PROCESSES if stack_robot.protocol == "can" else stack_robot
+        harder = {"can": CAN_BETWEEN_PROCESSES, "mavlink": MAVLINK_SIGNED}
+        self.stack_robot = harder.get(stack_robot.protocol, stack_robot)
+        key = folder / MAVLINK_KEY
+        key.touch(0o600)
+        key.write_text(secrets.token_hex(32), encoding="ascii")
         self.address = RunAddress.free(folder, domain)
         self._robot_file = self.stack_robot.write_file(folder / "robot.toml", self.address)
         self.config: RobotConfig = load_robot_config(self._robot_file)
-        self._bus = self.address.filled("{can_group}" if stack_robot.protocol == "can" else "{domain}")
+        places = {"can": "{can_group}", "mavlink": f"{{udp_port}},{{folder}}/{MAVLINK_KEY}"}
+        self._bus = self.address.filled(places.get(stack_robot.protocol, "{domain}"))
         self._sniffs = stack_robot.protocol != "mavlink"
         self.received = ReceivedCommands(folder / ("received.jsonl" if self._sniffs else "trace.jsonl"))
         self.stand_in = self._is_stand_in = False

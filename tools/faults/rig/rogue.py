@@ -3,6 +3,7 @@
     python -m tools.faults.rig.rogue unitree 7 --duration 1
     python -m tools.faults.rig.rogue can 239.74.163.2
     python -m tools.faults.rig.rogue ros2 7
+    python -m tools.faults.rig.rogue mavlink 14580,/tmp/mavlink.key
 
 Finds the robot, waits for SIGUSR1, prints the monotonic ns at which it begins, and sends until the time is over.
 """
@@ -16,10 +17,12 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import can
 from can.interfaces.udp_multicast.utils import pack_message
+from pymavlink.dialects.v20 import common
 
 from firmware_bridge.can.multicast import PORT
 from firmware_bridge.core.config import DdsConfig
@@ -29,6 +32,7 @@ from firmware_bridge.ros2.messages.common import Twist_, Vector3_
 from firmware_bridge.unitree.messages import ids
 from firmware_bridge.unitree.rpc import RpcClient, move_parameter
 from sim_hil.protocols.can.frames import Encoder
+from sim_hil.protocols.mavlink.wire import Writer, now_ticks, read_key
 from sim_hil.protocols.ros2.topics import COMMAND_TOPIC
 
 _FIND_TIMEOUT_S = 10.0
@@ -89,18 +93,45 @@ def _can(group: str) -> Iterator[Callable[[], None]]:
         yield send
 
 
+@contextlib.contextmanager
+def _mavlink(place: str) -> Iterator[Callable[[], None]]:
+    """A ground station with the link's key, whose setpoints the rover refuses; it requests the setpoint mode."""
+    port, _, key = place.partition(",")
+    writer = Writer(255, 190, read_key(Path(key)), now_ticks())
+    heartbeat = common.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
+    setpoint = common.MAVLink_set_position_target_local_ned_message(
+        0, 1, 1, 8, 1479, 0, 0, 0, _SPEED_MPS, 0, 0, 0, 0, 0, 0, 0
+    )
+    mode = common.MAVLink_command_long_message(1, 1, 176, 0, 1, 6, 0, 0, 0, 0, 0)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station:
+        station.connect(("127.0.0.1", int(port)))
+        station.settimeout(_FIND_TIMEOUT_S)
+        station.send(writer.pack(heartbeat))
+        try:
+            station.recv(2048)
+        except OSError as error:
+            raise NoRobotError(f"no answer of a rover: {error}") from error
+
+        def send() -> None:
+            for message in (heartbeat, setpoint, mode):
+                writer.advance(now_ticks())
+                station.send(writer.pack(message))
+
+        yield send
+
+
 def _ignore(_: object) -> None:
     """Discard a result."""
 
 
-COMMANDERS = {"unitree": _unitree, "ros2": _ros2, "can": _can}
+COMMANDERS = {"unitree": _unitree, "ros2": _ros2, "can": _can, "mavlink": _mavlink}
 
 
 def main(argv: list[str] | None = None) -> int:
     """Command the robot for the duration, then exit."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("protocol", choices=tuple(COMMANDERS))
-    parser.add_argument("address", help="DDS domain, or multicast address of the CAN bus")
+    parser.add_argument("address", help="DDS domain, multicast address of the CAN bus, or UDP port,KEY FILE")
     parser.add_argument("--duration", type=float, default=1.0, help="s (default: 1)")
     args = parser.parse_args(argv)
     signal.pthread_sigmask(

@@ -20,6 +20,8 @@ CONTRACT = frozenset(
         *("date jumps an hour ahead", "date jumps an hour back"),
         *("every frame twice", "every 20th frame corrupted", "every frame corrupted", "bus-off"),
         *("babbling node, 95 % of the bus", "babbling node, the whole bus"),
+        *("unsigned packets", "packets with another key", "recorded packets again", "packets of another system"),
+        "pilot's mode switch",
         *("a fifth of the packets late by 100 ms", "every packet twice", "every message twice"),
     }
 )

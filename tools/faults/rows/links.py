@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from sim_hil.protocols.mavlink import forger
 from sim_hil.realtime.robots import StackRobot
 from tools.faults.rig.processes import Rig
 from tools.faults.rows.row import Judge, Row, clear, own_stop_ms, robot_fault
 
+TAKEOVER_MS = 100
+"""Bound on the stop after a pilot's switch, ms: a heartbeat at once and one period of the bridge."""
 BABBLE_HZ = 3650.0
 """Frames of a babbling node that fill 95 % of a bus of 500 kbit/s, 130 bits each, 1/s."""
 _ALL_HZ = 4000.0  # more than the bus carries
@@ -76,7 +79,14 @@ def _mavlink(own_ms: float) -> tuple[tuple[Row, ...], tuple[Row, ...]]:
         _degraded("200 ms jitter", own_ms, jitter_ms=200.0),
         _degraded("a fifth of the packets late by 100 ms", own_ms, reorder_percent=20.0, reorder_ms=100.0),
         _degraded("every packet twice", own_ms, duplicate_percent=100.0),
-    ), ()
+    ), (
+        robot_fault("unsigned packets", "mavlink-forged", forger.UNSIGNED),
+        robot_fault("packets with another key", "mavlink-forged", forger.WRONG_KEY),
+        robot_fault("recorded packets again", "mavlink-forged", forger.REPLAYED),
+        robot_fault("packets of another system", "mavlink-forged", forger.OTHER_SYSTEM),
+        replace(robot_fault("pilot's mode switch", "emergency-stop", "pilot"), bound=TAKEOVER_MS),
+        _second_commander(),
+    )
 
 
 def _ros2(own_ms: float) -> tuple[tuple[Row, ...], tuple[Row, ...]]:
