@@ -95,7 +95,8 @@ def _run(args: argparse.Namespace) -> int:
         done = len(read_results(folder)) if args.resume else 0
         with BenchProgress(len(run.episodes), done) as progress:
             execution = execute(
-                run, folder, _backend(args), resume=args.resume, video=args.video, stopped=lambda: bool(stop),
+                run, folder, _backend(args), resume=args.resume, video=args.video,
+                flights=args.flight_logs or ("none" if args.out is None else "failed"), stopped=lambda: bool(stop),
                 watcher=progress.watcher,
             )  # fmt: skip
         store, finished, result = execution.store, execution.finished, execution.result
