@@ -64,13 +64,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _check(args: argparse.Namespace) -> None:
     """Check the arguments before a root is made, which takes half an hour. Raises ValueError or OSError."""
     read_manifest(args.artifacts)
-    if next(read_messages(args.flight), None) is None:
-        raise ValueError(f"--flight {args.flight}: expected a flight log with messages")
     if not 0 < args.replay_to < 1e6:
         raise ValueError(f"--replay-to {args.replay_to}: expected seconds above 0")
     if not 0 <= args.domain <= MAX_DOMAIN:
         raise ValueError(f"--domain {args.domain}: expected 0 to {MAX_DOMAIN}")
     check_result_directory(args.out)
+    if next(read_messages(args.flight), None) is None:
+        raise ValueError(f"--flight {args.flight}: expected a flight log with messages")
     check_result_directory(args.root, "--root")
 
 

@@ -21,7 +21,7 @@ from firmware_bridge.system.terminal import one_line
         ("\x1b]0;title\x07weights", r"\x1b]0;title\x07weights"),
         ("a\x9b2Jb", r"a\x9b2Jb"),
         ("\ud800", r"\ud800"),
-        ("cosine ≥ 0.99, 90°\n\tnext", "cosine ≥ 0.99, 90°\n\tnext"),
+        ("cosine ≥ 0.99, 90°\n\tnext", r"cosine ≥ 0.99, 90°\n\tnext"),
     ],
 )
 def test_control_characters_of_a_name_never_reach_the_terminal(

@@ -18,6 +18,7 @@ from tests.support.bad_input.values import (
     outputs,
     texts,
     toml_files,
+    unreadable_directories,
 )
 
 ROBOT: Final = Path(firmware_bridge.__file__).parent / "robots" / "go2_sim.toml"
@@ -77,7 +78,7 @@ TABLE: Final = (
     _console("edge-install", "units file",
          f"units --artifacts {{artifacts}} --robot {ROBOT} --instruction-file x --arm-at-start --out {{folder}}/units",
         {"--instruction-file": other_files(
-            ".txt", "escape-key", "json-null", "json-text", "nan-json", "nan-toml", "wrong-types")}),
+            ".txt", "escape-key", "json-null", "json-text", "nan-json", "nan-toml", "wrong-types", "zip")}),
     _console(
         "edge-install", "dds", "dds --dry-run --prefix {folder}/prefix",
         {"--archive": texts("", "/nope", "/dev", "/dev/zero", "/dev/null/x", "x" * 300)},
@@ -85,7 +86,7 @@ TABLE: Final = (
     _console(
         "edge-install", "board",
          "board --wheel {folder}/x.whl --artifacts {artifacts} --home {folder}/home --dry-run",
-        {"--wheel": other_files(".whl"), "--artifacts": directories, "--keep": counts, "--wheels": directories,
+        {"--wheel": other_files(".whl"), "--artifacts": unreadable_directories, "--keep": counts, "--wheels": texts("/nope", "/dev/null", "/dev/null/x"),
          "--extras": texts("a;b", "x y", "\x1b[2J"), "--constraints": texts("", "/nope", "/dev", "/dev/zero",
          "x" * 300)},
     ),

@@ -84,6 +84,11 @@ def directories(folder: Path) -> Iterator[Bad]:
         yield Bad(device, device)
 
 
+def unreadable_directories(folder: Path) -> Iterator[Bad]:
+    """Folders of which a command does not even read the first file."""
+    return (bad for bad in directories(folder) if bad.label not in ("binary", "deep"))
+
+
 def outputs(folder: Path) -> Iterator[Bad]:
     """Files that cannot be written, which a command finds before it works."""
     made = folder / "outputs"
