@@ -86,7 +86,8 @@ TABLE: Final = (
     _console(
         "edge-install", "board",
          "board --wheel {folder}/x.whl --artifacts {artifacts} --home {folder}/home --dry-run",
-        {"--wheel": other_files(".whl"), "--artifacts": unreadable_directories, "--keep": counts, "--wheels": texts("/nope", "/dev/null", "/dev/null/x"),
+        {"--wheel": other_files(".whl"), "--artifacts": unreadable_directories, "--keep": counts,
+         "--wheels": texts("/nope", "/dev/null", "/dev/null/x"),
          "--extras": texts("a;b", "x y", "\x1b[2J"), "--constraints": texts("", "/nope", "/dev", "/dev/zero",
          "x" * 300)},
     ),
