@@ -23,16 +23,20 @@ from edge.artifacts.files import (
 from edge.artifacts.providers import wrong_option
 from edge.artifacts.trust import Trust
 from edge.state.reasoning_text import WAYPOINT_TIMES_S
-from edge.state.switches import Decoding, RecoverySwitch
+from edge.state.switches import Decoding, RecoverySwitch, Speculation, Switches
 from firmware_bridge.core.config import BRIDGE_PRIORITY
 
 LANGUAGE_WHOLE = ("language_model",)
 LANGUAGE_PAIR = ("language_model.prefill", "language_model.decode")
+MOST_ROWS = 16
+"""Most positions of one call whose next token a language graph chooses."""
 _POSITIVE = frozenset((
     "image_px", "frame_tokens", "kv_dim", "max_context", "max_new_tokens", "prefill_chunk_tokens", "tick_period_ms",
     "step_s",
 ))  # fmt: skip
-_SWITCHES: Mapping[str, type[Decoding | RecoverySwitch]] = {"decoding": Decoding, "recovery": RecoverySwitch}
+_SWITCHES: Mapping[str, type[Decoding | RecoverySwitch | Speculation]] = {
+    "decoding": Decoding, "recovery": RecoverySwitch, "speculation": Speculation
+}  # fmt: skip
 _LISTS = ("frame_offsets_s", "control_cores", "reasoning_cores")
 
 
@@ -113,7 +117,13 @@ class RuntimeConfig:
     """Real-time priority of the control thread, above 0 and below the bridge's; 0: none."""
     decoding: Decoding = Decoding.CONSTRAINED
     recovery: RecoverySwitch = RecoverySwitch.ON
+    speculation: Speculation = Speculation.ON
     """Default switches, which a command's options override; older manifests lack them."""
+
+    @property
+    def switches(self) -> Switches:
+        """The default switches; standing at the goal is no setting of a manifest."""
+        return Switches(self.decoding, self.recovery, False, self.speculation)
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -330,7 +340,7 @@ def check_contract(artifacts: Artifacts) -> None:
         (vision, tokens, "float", (1, *tokens.shape[1:])),
         (first, first.input("visual_tokens"), "float", ("F", *tokens.shape[1:])),
         (first, first.input("image_offset"), "int64", (1,)),
-        (last, last.output("next_token"), "int64", (1, 1)),
+        (last, last.output("next_token"), "int64", (1, "L")),
         (context, *_guidance(artifacts)),
         (action, action.input("visual_tokens"), "float", tokens.shape),
         (action, action.input("state"), "float", (1, 3)),

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 from edge.artifacts.manifest import Artifacts, load_artifacts
 from edge.core.geometry import SE2
+from edge.inference.calls import Chunk, chunks, set_last_apart
 from edge.inference.graph import CancelledError, Interrupt
-from edge.inference.language import Chunk, ContextOverflowError, LanguageModel, chunks, set_last_apart
+from edge.inference.language import ContextOverflowError, LanguageModel
 from edge.reasoning.prompt import Segment
 from edge.state.ring import EncodedFrame
 
