@@ -27,16 +27,17 @@ class Ros2Camera:
         network: DdsConfig | SharedBus,
         topic: str,
         raw: bool,
-        best_effort: bool = True,
         *,
+        reliable: bool = False,
         latency_ns: int = 0,
     ) -> None:
         """`network`: a process that reads more than one topic shares a SharedBus and closes it itself.
 
-        `raw`: the topic carries sensor_msgs/Image. `latency_ns`: age of a picture when it arrives.
+        `raw`: the topic carries sensor_msgs/Image. `reliable`: ask for lost pictures again, which matches reliable
+        publishers only. `latency_ns`: age of a picture when it arrives.
         """
         check_topic_name("camera.source", topic)
-        self._topic, self._raw, self._best_effort = dds_topic(topic), raw, best_effort
+        self._topic, self._raw, self._reliable = dds_topic(topic), raw, reliable
         self._latency_ns = latency_ns
         self._owns_bus = isinstance(network, DdsConfig)
         self._bus = SharedBus(network) if isinstance(network, DdsConfig) else network
@@ -67,7 +68,7 @@ class Ros2Camera:
         kind = Image_ if self._raw else CompressedImage_
         try:
             bus = self._bus.open()
-            reader = bus.reader(self._topic, kind, reliable=not self._best_effort)
+            reader = bus.reader(self._topic, kind, reliable=self._reliable)
             waitset = bus.waitset(reader)
             while not closing.is_set():
                 waitset.wait(_WAIT_NS)

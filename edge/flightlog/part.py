@@ -1,4 +1,4 @@
-"""One file of a flight log: a whole MCAP that Foxglove opens, written straight to the operating system."""
+"""One file of a flight log: a whole MCAP that any viewer opens, written straight to the operating system."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ from typing import IO, Any, cast
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
-from edge.flightlog.schemas import ANY_OBJECT, COMPRESSED_IMAGE, SCHEMAS
+from edge.flightlog.schemas import ANY_OBJECT, SCHEMAS
+from edge.flightlog.standard_messages import StandardMessages
+from edge.flightlog.standard_schemas import COMPRESSED_IMAGE, STANDARD_SCHEMAS, Schema
 
 Payload = Mapping[str, Any] | bytes
 
@@ -76,7 +78,10 @@ class PartFile:
 
 
 class LogPart:
-    """An MCAP writer that registers a topic's channel when its first message comes."""
+    """An MCAP writer that registers a topic's channel when its first message comes.
+
+    Beside every record it writes the messages of `StandardMessages`, which any viewer shows.
+    """
 
     def __init__(self, file: PartFile, number: int) -> None:
         self.file = file
@@ -84,6 +89,7 @@ class LogPart:
         self._writer = Writer(cast(IO[bytes], file), chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._channels: dict[str, int] = {}
         self._sequence: Counter[str] = Counter()
+        self._standard = StandardMessages()
         self._writer.start(profile="", library="tic-vla-edge")
         # Log times are monotonic; this pair of readings turns them into dates.
         clock = {"clock": "monotonic", "monotonic_ns": str(time.monotonic_ns())}
@@ -96,11 +102,16 @@ class LogPart:
         return topic in self._channels
 
     def add(self, topic: str, stamp_ns: int, payload: Payload) -> None:
-        """Append one record; raises TypeError or ValueError when JSON cannot hold it, and OSError."""
+        """Append a record and its standard messages; raises TypeError or ValueError outside JSON, and OSError."""
+        schema = COMPRESSED_IMAGE if isinstance(payload, bytes) else SCHEMAS.get(topic, ANY_OBJECT)
+        self._append(topic, stamp_ns, payload, schema)
+        for message in self._standard.of(topic, stamp_ns, payload):
+            self._append(*message, STANDARD_SCHEMAS[message.topic])
+
+    def _append(self, topic: str, stamp_ns: int, payload: Payload, schema: Schema) -> None:
         data = encode(payload, stamp_ns)
         channel = self._channels.get(topic)
         if channel is None:
-            schema = COMPRESSED_IMAGE if isinstance(payload, bytes) else SCHEMAS.get(topic, ANY_OBJECT)
             schema_id = self._writer.register_schema(schema["title"], "jsonschema", json.dumps(schema).encode())
             channel = self._writer.register_channel(topic, "json", schema_id)
             self._channels[topic] = channel

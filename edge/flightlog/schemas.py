@@ -1,4 +1,4 @@
-"""JSON schemas of the flight log's topics, so that a viewer (Foxglove) can list and plot the fields.
+"""JSON schemas of the runner's own records in the flight log, so that a viewer can list and plot the fields.
 
 A table, not code: one entry per topic. Names carry their units; stamps are monotonic ns of the recording machine. A
 number that is not finite is null in the log, so whatever is computed may be null.
@@ -7,9 +7,8 @@ number that is not finite is null in the log, so whatever is computed may be nul
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
-Schema = dict[str, Any]
+from edge.flightlog.standard_schemas import COMPRESSED_IMAGE, Schema
 
 _ANY: Schema = {}
 _INT: Schema = {"type": "integer"}
@@ -33,19 +32,10 @@ def _record(title: str, optional: tuple[str, ...] = (), **properties: Schema) ->
     return {"title": title, "type": "object", "properties": properties, "required": required}
 
 
-COMPRESSED_IMAGE: Schema = _record(
-    "foxglove.CompressedImage",
-    timestamp={"type": "object", "title": "time", "properties": {"sec": _INT, "nsec": _INT}},
-    frame_id=_TEXT,
-    format=_TEXT,
-    data={"type": "string", "contentEncoding": "base64"},
-)
-"""Foxglove's well-known schema; the name in the title is what makes a viewer show the topic as a picture."""
-
 SCHEMAS: Mapping[str, Schema] = {
     "/run": _record(
         "tic_vla.Run",
-        ("limits", "release", "decoding", "recovery", "stand_at_goal", "speculation"),
+        ("limits", "mount", "release", "decoding", "recovery", "stand_at_goal", "speculation"),
         instruction=_TEXT,
         mode=_TEXT,
         decoding=_TEXT,  # Switches: what was in force
@@ -57,6 +47,7 @@ SCHEMAS: Mapping[str, Schema] = {
         release=_INT_OR_NULL,  # counter of the artifacts' signature
         robot=_TEXT,
         limits=_NUMBERS_BY_NAME,  # LimitsConfig: what the commands were held to
+        mount={"type": ["object", "null"], "additionalProperties": _NUMBER_OR_NULL},  # of the camera
         release_delay=_ANY,
         started_ns=_INT,
         tick_period_ms=_NUMBER,

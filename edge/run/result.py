@@ -30,6 +30,7 @@ def run_record(artifacts: Artifacts, robot: RobotConfig, options: RunOptions, st
         "robot": robot.name,
         "release": artifacts.release,
         "limits": asdict(robot.limits),
+        "mount": None if robot.mount is None else asdict(robot.mount),
         "release_delay": {"mean_s": delay.mean_s, "sd_s": delay.sd_s, "seed": delay.seed},
         "started_ns": started_ns,
         "tick_period_ms": artifacts.runtime.tick_period_ms,

@@ -80,5 +80,8 @@ def open_camera(robot: RobotConfig, bus: SharedBus | None = None) -> CameraSourc
     if kind in ("ros2", "ros2raw"):
         from edge.cameras.ros2 import Ros2Camera  # needs the extra of its protocol
 
-        return Ros2Camera(bus or robot.network, address, raw=kind == "ros2raw", latency_ns=latency_ns)
+        reliable = robot.ros2 is not None and robot.ros2.reliable_inputs
+        return Ros2Camera(
+            bus or robot.network, address, raw=kind == "ros2raw", reliable=reliable, latency_ns=latency_ns
+        )
     raise ValueError(f"camera.source {robot.camera.source}: expected http, v4l2, gstreamer, ros2 or ros2raw")

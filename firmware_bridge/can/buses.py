@@ -16,7 +16,7 @@ from firmware_bridge.can.frame import Frame
 from firmware_bridge.core.config_can import INTERFACES
 from firmware_bridge.core.robot_state import LinkOpenError
 
-_OTHER_FORMAT: Final = 0x80000000  # keeps identifiers of 29 bits and remote frames apart from ours
+_OTHER_FORMAT: Final = 0x80000000  # keeps identifiers of 29 bits, remote frames and CAN FD apart from ours
 _MOST_ECHOES: Final = 256
 
 
@@ -69,7 +69,7 @@ def open_bus(address: BusAddress) -> can.BusABC:
 
 def as_frame(message: can.Message) -> Frame:
     """Return a received message as a frame; one of another format gets an identifier that no DBC message has."""
-    other = _OTHER_FORMAT if message.is_extended_id or message.is_remote_frame else 0
+    other = _OTHER_FORMAT if message.is_extended_id or message.is_remote_frame or message.is_fd else 0
     identifier = message.arbitration_id if message.is_error_frame else message.arbitration_id | other
     return Frame(identifier, bytes(message.data[:8]), error=message.is_error_frame)
 

@@ -217,6 +217,10 @@ class _Loader:
         slow = cycle_ns > 0 and cycle_ns * rate_hz < 1_000_000_000
         need = f"{1_000_000_000 / cycle_ns:g} at least" if cycle_ns else ""
         require(not slow, f"bridge.rate_hz: expected {need} (cycle time of {vx.message}), found {rate_hz}")
+        timeout_ms = self._can.command.base_timeout_ms
+        patient = timeout_ms * rate_hz > 2 * 1000
+        need = f"more than {2 * 1000 / rate_hz:g} (one lost command at {rate_hz} Hz must not stop the base)"
+        require(patient, f"can.command.base_timeout_ms: expected {need}, found {timeout_ms}")
         if self._can.mode is not None:
             alone = signals["can.mode.request"].message != vx.message
             require(alone, f"can.mode.request: expected a message other than the velocity command's ({vx.message})")

@@ -59,10 +59,14 @@ class Counts:
 
 
 class _BaseClock:
-    """The base's time of each odometry sample, from its counter and, where there is one, its clock signal."""
+    """The base's time of each odometry sample, from its counter and, where there is one, its clock signal.
 
-    def __init__(self, cycle_ns: int, period: int) -> None:
+    `is_known` is False until a base with a clock signal has sent it: a stamp counted before would be of another clock.
+    """
+
+    def __init__(self, cycle_ns: int, period: int, *, is_known: bool) -> None:
         self._cycle_ns, self._period = cycle_ns, period
+        self.is_known = is_known
         self._counter: int | None = None
         self._received_ns = 0
         self.stamp_ns = cycle_ns
@@ -80,6 +84,7 @@ class _BaseClock:
 
     def set(self, uptime_ns: int) -> None:
         """Take the base's own clock where the counted one has left it."""
+        self.is_known = True
         if abs(uptime_ns - self.stamp_ns) > max(_CLOCK_STEP_NS, 5 * self._cycle_ns // 2):
             self.stamp_ns = uptime_ns
 
@@ -101,7 +106,8 @@ class BaseReader:
         vital = {signal.message for where, signal in signals.items() if where.startswith(_STATE_PLACES)}
         self._vital = [self._by_name[name] for name in vital]
         first = self._sample[0].message
-        self._clock = _BaseClock(first.cycle_ns, 1 if first.protection is None else first.protection.counter_period)
+        period = 1 if first.protection is None else first.protection.counter_period
+        self._clock = _BaseClock(first.cycle_ns, period, is_known="can.uptime" not in signals)
         self._order = StampOrder()
         self._wheels = None if config.wheels is None else WheelOdometry(config.wheels.track_m)
         self._agreement = AgreementCheck(config.agreement)
@@ -214,7 +220,7 @@ class BaseReader:
             stream.fresh = False
         passed_ns = self._clock.advance(self._sample[0].counter(), now_ns)
         state = self._built_state(passed_ns / 1e9, now_ns)
-        if state is not None and self._order.accept(state):
+        if state is not None and self._clock.is_known and self._order.accept(state):
             self._state = state
 
     def _built_state(self, passed_s: float, now_ns: int) -> RobotState | None:

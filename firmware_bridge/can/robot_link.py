@@ -20,6 +20,8 @@ from firmware_bridge.core.step_types import Identify, Move, Report, Request, Sta
 _MOST_FRAMES: Final = 256
 """Frames read in one step: more than a full bus of 1 Mbit/s carries in 20 ms (180), so a backlog shrinks."""
 _FAILING_WRITES: Final = 3  # in a row: 60 ms at 50 Hz, inside the 100 ms of fault matrix row 46
+_FAILING_NS: Final = 1_000_000_000
+"""Time after which a refused frame proves nothing: a bridge that sends nothing would otherwise never arm again."""
 _REOPEN_NS: Final = 500_000_000
 _STOPS_IGNORED: Final = 20
 """Requests to stop, every 100 ms, after which a base that still moves gets its own emergency stop."""
@@ -40,7 +42,7 @@ class RobotLink:
         self._reader = BaseReader(self._can, self._database, self._now_ns)
         self._sender = FrameSender(self._database)
         self._bus: FrameBus | None = self._opened()
-        self._reopen_ns = 0
+        self._reopen_ns = self._refused_ns = 0
         self._failing = self._failed = self._line_errors = self._stops = 0
         self._health = self._reader.health.state
         self._mode = 0 if self._can.mode is None else self._can.mode.disarm
@@ -75,6 +77,8 @@ class RobotLink:
         self._send_cyclic()
         report = self._reader.take(now_ns)
         self._report_changes()
+        if now_ns - self._refused_ns > _FAILING_NS:
+            self._failing = 0
         fails = self._bus is None or self._failing >= _FAILING_WRITES or self._reader.health.state != "active"
         return replace(report, writes_fail=fails)
 
@@ -156,6 +160,7 @@ class RobotLink:
         else:
             self._failing += 1
             self._failed += 1
+            self._refused_ns = self._now_ns
 
     def _lose_bus(self, reason: str) -> None:
         self._report(f"{reason}; opening it again when it is back")

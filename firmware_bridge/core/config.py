@@ -111,8 +111,11 @@ class RobotConfig:
             require(given or not needed, f"missing table [{table}]; protocol {self.protocol} needs it")
             require(needed or not given, f"unexpected table [{table}]; protocol {self.protocol} does not use it")
         self.camera.check_protocol(self.protocol)
-        charge_known = self.ros2 is None or self.ros2.battery != "" or self.safety.battery_min_percent == 0
+        unasked = self.safety.battery_min_percent == 0
+        charge_known = self.ros2 is None or self.ros2.battery != "" or unasked
         require(charge_known, "missing key ros2.battery; without a battery topic write safety.battery_min_percent = 0")
+        charge_known = self.can is None or self.can.battery is not None or unasked
+        require(charge_known, "missing table [can.battery]; without one write safety.battery_min_percent = 0")
         for key, (walking, fastest) in FASTEST[self.protocol].items():
             value: float = getattr(self.limits, key)
             permitted = fastest if self.safety.above_walking_speed else walking

@@ -35,10 +35,15 @@ class CanTable(Section):
 
 @dataclass(frozen=True)
 class CanCommand(CanTable):
-    """Velocity command: both signals are in one message, which is sent at the bridge's rate."""
+    """Velocity command: both signals are in one message, which is sent at the bridge's rate.
+
+    `base_timeout_ms`: time after which the base stops by itself without a new command, as its maker states or the user
+    has measured. Nothing else stops the base when the bridge or the cable dies.
+    """
 
     vx: str
     wz: str
+    base_timeout_ms: int = within_range(20, 2000)
 
     table_name = "can.command"
     SIGNALS = ("vx", "wz")

@@ -11,6 +11,8 @@ from firmware_bridge.core.sections import Section, require, within_range
 LONGEST_BASE_TIMEOUT_MS: Final = 2000
 """Longest own timeout of a base that may drive without supervision, ms (our choice: 1.6 m at 0.8 m/s)."""
 MAX_NAME_CHARS: Final = 200
+BEST_EFFORT: Final = "best_effort"
+RELIABLE: Final = "reliable"
 # design.ros2.org, "Topic and Service name mapping to DDS"; substitutions such as ~ and {node} need a node's name.
 _TOKEN: Final = "[A-Za-z_][A-Za-z0-9_]*"
 _NAME: Final = re.compile(f"(?!.*__)/?{_TOKEN}(?:/{_TOKEN})*")
@@ -23,6 +25,8 @@ class Ros2Config(Section):
 
     A topic that starts with "/" is a full name; any other is relative to `namespace`. `imu`, `battery` and
     `instruction` are not used when they are absent. `stamped`: the command is a TwistStamped in `command_frame`.
+    `input_reliability` of odometry, IMU, battery and pictures: "best_effort" matches every publisher; "reliable" brings
+    lost messages again, but only from reliable publishers. `command_reliability`: "reliable" matches every subscriber.
     `other_command_publishers`: number of other nodes that are known to offer the command topic and to stay silent.
     `base_timeout_ms`: time after which the base stops by itself without a new command, as its maker states or the user
     has measured; 0: it never does. Such a base, and one slower than LONGEST_BASE_TIMEOUT_MS, needs `supervised = true`:
@@ -38,6 +42,8 @@ class Ros2Config(Section):
     imu: str = ""
     battery: str = ""
     instruction: str = ""
+    input_reliability: str = BEST_EFFORT
+    command_reliability: str = RELIABLE
     other_command_publishers: int = within_range(0, 8, 0)
     supervised: bool = False
 
@@ -49,6 +55,9 @@ class Ros2Config(Section):
         require(
             bool(frame_ok), f'ros2.command_frame: expected a frame such as "base_link", found {self.command_frame!r}'
         )
+        for key in ("input_reliability", "command_reliability"):
+            known = getattr(self, key) in (BEST_EFFORT, RELIABLE)
+            require(known, f'ros2.{key}: expected "{BEST_EFFORT}" or "{RELIABLE}", found {getattr(self, key)!r}')
         used: dict[str, str] = {}
         for key in ("odometry", "command", "imu", "battery", "instruction"):
             name: str = getattr(self, key)
@@ -63,6 +72,11 @@ class Ros2Config(Section):
             " drives on when the bridge dies; give the base a command timeout, or write ros2.supervised = true and keep"
             " a person at the base's own emergency stop",
         )
+
+    @property
+    def reliable_inputs(self) -> bool:
+        """Whether odometry, IMU, battery and pictures are read reliably."""
+        return self.input_reliability == RELIABLE
 
     def topic(self, name: str) -> str:
         """Return the DDS name of a topic of this table: `rt` and the full ROS name."""

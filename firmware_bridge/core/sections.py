@@ -78,13 +78,18 @@ def runtime_dir() -> Path:
 
 @dataclass(frozen=True)
 class DdsConfig(Section):
-    """Network of the robot: DDS domain, our interface, and unicast peers for links without multicast."""
+    """Network of the robot: DDS domain, our interface, and unicast peers for links without multicast.
+
+    `participants`: most programs on one machine that use the domain. A Go2 has room for 10.
+    """
 
     domain: int
     interface: str
     peers: tuple[str, ...] = ()
+    participants: int = within_range(1, 120, 10)  # DDSI-RTPS 2.5, 9.6.2.4: 120 of them have ports of their own
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         require(0 <= self.domain <= 232, f"dds.domain: expected 0..232 (RTPS port range), found {self.domain}")
         for text in (self.interface, *self.peers):  # they are pasted into Cyclone's XML
             legal = text != "" and all(c.isalnum() or c in ".:-_" for c in text)

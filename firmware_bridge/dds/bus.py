@@ -29,18 +29,19 @@ _FRESH: Final = ViewState.Any | InstanceState.Alive | SampleState.NotRead
 def domain_xml(config: DdsConfig, max_sample_bytes: int = MAX_SAMPLE_BYTES) -> str:
     """Cyclone DDS configuration that also finds 0.10.2 peers, with and without multicast (protocol facts, section 1).
 
-    `ParticipantIndex auto` up to 9 is 0.10.2's own port range: at most ten participants a host. Tracing stays off, so
-    nothing is written to a fixed path in /tmp. Discovery fills a receive buffer from end to end, a few hundred bytes a
-    second, before the next takes its place: Cyclone's own 1 MiB looks like a leak for half an hour, 96 KiB are full
-    within minutes. A chunk is one packet: more than UDP has.
+    `ParticipantIndex auto` up to 9 is 0.10.2's own port range: at most ten participants a host, unless the robot file
+    has `dds.participants`. Tracing stays off, so nothing is written to a fixed path in /tmp. Discovery fills a receive
+    buffer from end to end, a few hundred bytes a second, before the next takes its place: Cyclone's own 1 MiB looks
+    like a leak for half an hour, 96 KiB are full within minutes. A chunk is one packet: more than UDP has.
     """
     peers = "".join(f'<Peer address="{peer}"/>' for peer in config.peers)
     return (
         '<CycloneDDS><Domain Id="any"><General><Interfaces>'
         f'<NetworkInterface name="{config.interface}" priority="default" multicast="default"/>'
         "</Interfaces></General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
-        f"<MaxAutoParticipantIndex>9</MaxAutoParticipantIndex><Peers>{peers}</Peers></Discovery><Sizing>"
-        "<ReceiveBufferSize>96 KiB</ReceiveBufferSize><ReceiveBufferChunkSize>66 KiB</ReceiveBufferChunkSize></Sizing>"
+        f"<MaxAutoParticipantIndex>{config.participants - 1}</MaxAutoParticipantIndex><Peers>{peers}</Peers>"
+        "</Discovery><Sizing><ReceiveBufferSize>96 KiB</ReceiveBufferSize>"
+        "<ReceiveBufferChunkSize>66 KiB</ReceiveBufferChunkSize></Sizing>"
         f"<Internal><MaxSampleSize>{max_sample_bytes} B</MaxSampleSize></Internal></Domain></CycloneDDS>"
     )
 
@@ -59,23 +60,30 @@ class Bus:
             if error.code == DDSException.DDS_RETCODE_PRECONDITION_NOT_MET:
                 raise DdsError(f"{where}: this process has already opened it; close that Bus or share it") from error
             raise DdsError(
-                f"{where} ({error.msg}); check the interface's name with `ip link` and that at most ten programs on"
-                " this machine use the domain"
+                f"{where} ({error.msg}); check the interface's name with `ip link` and that at most"
+                f" {config.participants} programs on this machine use the domain (dds.participants)"
             ) from error
         self._topics: dict[str, Topic[Any]] = {}
 
     def reader(
         self, name: str, kind: Any, *, depth: int = 1, reliable: bool = False, foreign: bool = False
     ) -> DataReader[Any]:
-        """Reader of the newest `depth` samples; best effort matches every writer. `foreign`: not those of this Bus."""
+        """Reader of the newest `depth` samples; best effort matches every writer. `foreign`: not those of this Bus.
+
+        A `reliable` one matches reliable writers only.
+        """
         reliability = Policy.Reliability.Reliable(0) if reliable else Policy.Reliability.BestEffort
         local = Policy.IgnoreLocal.Participant if foreign else Policy.IgnoreLocal.Nothing
         qos = Qos(reliability, Policy.History.KeepLast(depth), local)
         return DataReader(self.participant, self._topic(name, kind), qos)
 
-    def writer(self, name: str, kind: Any, *, depth: int = 1) -> DataWriter[Any]:
-        """Reliable writer that never waits for a slow reader: the newest `depth` samples replace older ones."""
-        qos = Qos(Policy.Reliability.Reliable(0), Policy.History.KeepLast(depth))
+    def writer(self, name: str, kind: Any, *, depth: int = 1, reliable: bool = True) -> DataWriter[Any]:
+        """Writer that never waits for a slow reader: the newest `depth` samples replace older ones.
+
+        A `reliable` one matches every reader, the other only those that are best effort.
+        """
+        reliability = Policy.Reliability.Reliable(0) if reliable else Policy.Reliability.BestEffort
+        qos = Qos(reliability, Policy.History.KeepLast(depth))
         return DataWriter(self.participant, self._topic(name, kind), qos)
 
     def waitset(self, *readers: DataReader[Any]) -> WaitSet:

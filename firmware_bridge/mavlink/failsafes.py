@@ -55,6 +55,7 @@ def expectations(config: MavlinkConfig) -> tuple[Expectation, ...]:
     return (
         Expectation(("COM_OF_LOSS_T",), most=config.setpoint_loss_max_s, unit=" s"),
         Expectation(("COM_OBL_RC_ACT",), values=(5, 6, 7), meaning="hold, terminate or disarm"),
+        Expectation(("NAV_DLL_ACT",), values=(1, 5, 6), meaning="hold, terminate or disarm without a station"),
         Expectation(("COM_DL_LOSS_T",), most=config.station_loss_max_s, unit=" s"),
     )
 

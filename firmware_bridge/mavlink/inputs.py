@@ -31,7 +31,8 @@ _ATTITUDE: Final = 1
 _VELOCITY: Final = 2
 _POSITION: Final = 8 | 16  # relative or absolute
 _CONSTANT_POSITION: Final = 128  # nothing but the assumption that the rover stands
-_EKF_UNINITIALIZED: Final = 1024  # of EKF_STATUS_REPORT; in ESTIMATOR_STATUS the bit means a GPS glitch
+_ESTIMATOR_FAULTS: Final = 1024 | 2048  # of ESTIMATOR_STATUS: GPS glitch, accelerometer error
+_EKF_FAULTS: Final = 1024 | 32768  # of EKF_STATUS_REPORT: not initialised, GPS glitch
 
 
 @dataclass(frozen=True)
@@ -123,9 +124,12 @@ def battery_of_status(message: Message, received_ns: int) -> BatteryState | None
 
 
 def is_estimate_good(flags: int, *, is_ekf: bool) -> bool:
-    """Return whether an estimator has attitude, velocity and position; `is_ekf`: flags of EKF_STATUS_REPORT."""
+    """Return whether an estimator has attitude, velocity and position and reports no fault of a sensor.
+
+    `is_ekf`: the flags are those of EKF_STATUS_REPORT, else of ESTIMATOR_STATUS.
+    """
     whole = flags & _ATTITUDE and flags & _VELOCITY and flags & _POSITION
-    bad = _CONSTANT_POSITION | (_EKF_UNINITIALIZED if is_ekf else 0)
+    bad = _CONSTANT_POSITION | (_EKF_FAULTS if is_ekf else _ESTIMATOR_FAULTS)
     return bool(whole) and not flags & bad
 
 

@@ -46,6 +46,11 @@ class ModeWatch:
         """Note that the bridge arms: from now on it may request modes again."""
         self.yielded = False
 
+    def give_way(self) -> None:
+        """Note that another station commands the rover: no mode command until the next arming."""
+        self.yielded = True
+        self._asked.clear()
+
     def note_sequence(self, sequence: int) -> bool:
         """Take a packet's sequence number; return whether the packet is newer than every earlier one."""
         old = self._sequence is not None and (self._sequence - sequence) % 256 < _OLD_PACKETS

@@ -27,7 +27,7 @@ from firmware_bridge.mavlink.wire import Message
 CRITICAL, BAD_ESTIMATE, JUMPED, NO_HEARTBEAT = 1, 2, 3, 4
 ERROR_NAMES: Final[Mapping[int, str]] = {
     CRITICAL: "a failsafe is active",
-    BAD_ESTIMATE: "its estimator has no attitude, velocity or position",
+    BAD_ESTIMATE: "its estimator has no attitude, velocity or position, or reports a GPS glitch",
     JUMPED: "its odometry has jumped (reset_counter)",
     NO_HEARTBEAT: "no heartbeat for 3.5 s",
 }

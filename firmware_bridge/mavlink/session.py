@@ -16,7 +16,7 @@ from firmware_bridge.core.config import MavlinkConfig
 from firmware_bridge.core.step_types import Identify, Move, Report, Request, Stand
 from firmware_bridge.mavlink import modes, stations
 from firmware_bridge.mavlink.clock import VehicleClock
-from firmware_bridge.mavlink.commands import CommandQueue
+from firmware_bridge.mavlink.commands import ACCEPTED, IN_PROGRESS, CommandQueue
 from firmware_bridge.mavlink.failsafes import FailsafeCheck
 from firmware_bridge.mavlink.mode_watch import ModeWatch
 from firmware_bridge.mavlink.odometry import ERROR_NAMES, OdometryInput
@@ -115,10 +115,14 @@ class Session:
         number, sender = message.get_msgId(), (message.get_srcSystem(), message.get_srcComponent())
         if sender == (self._config.station, COMPONENT):
             self._clash_ns = now_ns  # an autopilot does not echo: a second bridge, or a forger
-        elif number in _OTHERS:
+        elif number in _OTHERS and sender != (self._config.system, AUTOPILOT):
             command = getattr(message, "command", 0)
-            if message.target_system in (0, self._config.system):
-                self._foreign = stations.foreign_message(number, command, sender) or self._foreign
+            target = getattr(message, "target_system", getattr(message, "target", 0))  # MANUAL_CONTROL: `target`
+            if target in (0, self._config.system):
+                foreign = stations.foreign_message(number, command, sender)
+                self._foreign = foreign or self._foreign
+                if foreign is not None and number in stations.COMMAND_MESSAGES:
+                    self._give_way()  # whether the autopilot obeys is not known: a person's mode must stay
         elif sender != (self._config.system, AUTOPILOT):
             # Heartbeats of ground stations that watch are welcome; every other value must be the autopilot's.
             self.reader.counts.strange += number != 0
@@ -139,6 +143,11 @@ class Session:
         if self.watch.yielded:
             self.commands.cancel(SET_MODE, ARM_DISARM)
 
+    def _give_way(self) -> None:
+        """Request no mode until the next arming: another station has commanded the rover."""
+        self.watch.give_way()
+        self.commands.cancel(SET_MODE, ARM_DISARM)
+
     def _parameter(self, message: Message, now_ns: int) -> None:
         name = message.param_id.split("\0")[0]
         self.failsafes.value(name, message.param_value, message.param_type)
@@ -150,10 +159,15 @@ class Session:
         foreign = stations.foreign_acknowledgement(command, target, own, requested)
         if foreign is not None:
             self._foreign = foreign
+            if message.result in (ACCEPTED, IN_PROGRESS):
+                self._give_way()  # the heartbeat with another station's mode may come later than this
         if target not in (own, (0, 0)) or foreign is not None:
             return
+        waited = self.commands.waits(command)
         failed = self.commands.acknowledge(command, message.result)
-        if command == SET_INTERVAL and not self.commands.waits(SET_INTERVAL) and self._intervals:
+        if command == SET_INTERVAL:
+            if not waited or self.commands.waits(SET_INTERVAL) or not self._intervals:
+                return
             self._intervals.pop(0)  # one that the autopilot does not know is left out
         elif failed is not None:
             name = stations.MOTION_COMMANDS.get(command, f"command {command}")

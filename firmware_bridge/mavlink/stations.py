@@ -37,6 +37,8 @@ MOTION_MESSAGES: Final = {
 """Messages that do."""
 COMMAND_INT: Final = 75
 COMMAND_LONG: Final = 76
+COMMAND_MESSAGES: Final = (11, COMMAND_INT, COMMAND_LONG)
+"""Messages that can change the mode or the arming: SET_MODE and commands."""
 
 
 def foreign_acknowledgement(command: int, target: tuple[int, int], own: tuple[int, int], requested: bool) -> str | None:

@@ -9,6 +9,7 @@ from typing import Any, Final
 from cyclonedds.sub import DataReader
 
 from firmware_bridge.core.config import RobotConfig, Ros2Config
+from firmware_bridge.core.config_ros2 import RELIABLE
 from firmware_bridge.core.robot_state import BatteryState, RobotState, StampOrder
 from firmware_bridge.core.sections import ConfigError
 from firmware_bridge.core.step_types import Move, Report, Request, StopMotion
@@ -42,10 +43,10 @@ class RobotLink:
         self._command_topic = command
         self._bus = bus = Bus(config.network, max_sample_bytes=_MAX_KEPT_BYTES)
         kind: Any = TwistStamped_ if settings.stamped else Twist_
-        # A reliable writer matches both kinds of subscribers, and a best-effort reader both kinds of publishers.
-        self._writer = bus.writer(command, kind)
+        self._writer = bus.writer(command, kind, reliable=settings.command_reliability == RELIABLE)
+        # Best effort, because it sees every publisher's commands.
         self._foreign_commands = bus.reader(command, kind, depth=8, foreign=True)
-        self._odometry = bus.reader(odometry, Odometry_)
+        self._odometry = bus.reader(odometry, Odometry_, reliable=settings.reliable_inputs)
         self._imu = _optional(bus, settings, settings.imu, Imu_)
         self._battery = _optional(bus, settings, settings.battery, BatteryState_)
         trusted = [settings.topic(name) for name in (settings.odometry, settings.imu, settings.battery) if name]
@@ -150,7 +151,7 @@ class RobotLink:
             kind = "TwistStamped" if self._settings.stamped else "Twist"
             return (
                 f"no node subscribes to {self._command_topic} as {kind}; start the base's driver, or correct"
-                " ros2.command and ros2.stamped in the robot file"
+                " ros2.command, ros2.stamped and ros2.command_reliability in the robot file"
             )
         if self._imu is not None and (self._attitude is None or now_ns - self._attitude.received_ns > _IMU_SILENT_NS):
             return f"no usable message on {self._settings.topic(self._settings.imu)} for {_IMU_SILENT_NS / 1e6:.0f} ms"
@@ -158,7 +159,7 @@ class RobotLink:
 
 
 def _optional(bus: Bus, settings: Ros2Config, name: str, kind: Any) -> DataReader[Any] | None:
-    return bus.reader(settings.topic(name), kind) if name else None
+    return bus.reader(settings.topic(name), kind, reliable=settings.reliable_inputs) if name else None
 
 
 def _few(reader: DataReader[Any] | None) -> Iterator[Any]:

@@ -30,7 +30,7 @@ from sim_hil.robots.odometry_noise import LEVELS
 from sim_hil.scene.scene import SceneError, load_scene
 from sim_hil.soak.faults import DEFAULT_MENU, SoakInputError, load_menu
 from sim_hil.soak.report import write_report
-from sim_hil.soak.run import SoakFolder, SoakOptions, run_legs, soak_result
+from sim_hil.soak.run import SoakFolder, SoakOptions, lost_budget, run_legs, soak_result
 from sim_hil.soak.verdict import DEFAULT_BUDGET, PASS, UNDECIDED, applicable, load_budget
 
 MODES: Final = ("async", "sync", "no-reasoning")
@@ -50,6 +50,7 @@ EXAMPLES = """examples:
 A leg is one run of the stack (edge-hil, edge-bridge, edge-run) in one scene, with one task after another.
 Default budget and faults: sim_hil/soak/budget.toml and sim_hil/soak/faults.toml; copy and change them. Only the go2
 has the faults of the robot's side: other robots get those that end a process.
+A soak ends after the leg in which a budget line failed that no later leg can mend.
 exit codes: 0 budget met, 1 budget exceeded, undecided, or no leg could run, 2 bad arguments or input,
             3 refused (artifacts), 130 interrupted (a report of the finished part is written)
 """
@@ -98,6 +99,9 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--robot", choices=tuple(ROBOTS), default=GO2.name, help=f"robot to drive (default {GO2.name})")
     p.add_argument("--domain", type=int, metavar="N", help="DDS domain of a robot with DDS (default: a free one)")
     p.add_argument("--keep-logs", action="store_true", help="keep the flight logs (about 0.5 GiB an hour)")
+    p.add_argument(
+        "--to-the-end", action="store_true", help="drive on although a budget line failed that no later leg can mend"
+    )
     p.add_argument("--resume", action="store_true", help="continue the soak in --out for the remaining time")
     p.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     return p
@@ -134,15 +138,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
     with stop_signals() as stop:
         failure = ""
+
+        def lost() -> str | None:
+            return None if args.to_the_end else lost_budget(soak, budget)
+
         try:
             with Progress("edge-soak: ", period_s=STATUS_PERIOD_S) as progress:
                 finished = run_legs(
                     soak, options, menu, stopped=lambda: bool(stop), show_status=progress.show, log=progress.log,
-                    keep_logs=args.keep_logs,
+                    lost=lost, keep_logs=args.keep_logs,
                 )  # fmt: skip
         except (StepError, ValueError) as error:
             finished, failure = False, str(error)
-        result = soak_result(soak, options, budget, finished=finished)
+        result = soak_result(soak, options, budget, menu, finished=finished)
         write_result(str(soak.path / "result.json"), result)
         write_result(args.json, result)
         _print(str(write_report(soak, result)))
@@ -150,6 +158,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             sys.stdout.write(summary_lines(result))
     if failure:
         return _report_error(failure, EXIT_CHECK_FAILED)
+    if not finished and not stop:
+        return _report_error(f"{lost()}; drive on with --resume --to-the-end", EXIT_CHECK_FAILED)
     if not finished:
         return _report_error(f"interrupted after {soak.elapsed_s:.0f} s; continue with --resume", EXIT_INTERRUPTED)
     return exit_code(result)

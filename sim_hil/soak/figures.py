@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from reporting.plot_style import BAD, COMMAND, INK, MUTED, PERSON, TRUTH, legend_above, new_figure, png, tidy
 from sim_hil.scene.map import draw_map, draw_mark, draw_path, map_view
 from sim_hil.scene.scene import Scene
-from sim_hil.soak.verdict import BRIDGE_PERIOD_MS, MIB, process_lives
+from sim_hil.soak.trends import BRIDGE_PERIOD_MS, SERIES, offsets_s, soak_times_s, trend, windows
+from sim_hil.soak.verdict import MIB, process_lives
 
 Array = NDArray[np.float64]
 Analysis = Mapping[str, Any]
@@ -25,18 +26,12 @@ _MAP_PX: Final = 1400
 _PATH, _GOAL, _REACHED, _STOP, _FAULT = (31, 111, 139), (107, 119, 133), (44, 140, 74), (179, 38, 30), (230, 140, 20)
 
 
-def offsets_s(legs: Sequence[Analysis]) -> list[float]:
-    """Return each leg's start time, s since the soak began."""
-    return [float(sum(leg["elapsed_s"] for leg in legs[:index])) for index in range(len(legs))]
-
-
 def _minutes(leg: Analysis, offset_s: float, stamps_ns: Sequence[int]) -> Array:
-    minutes: Array = (np.array(stamps_ns, float) - leg["begin_ns"]) / 6e10 + offset_s / 60
-    return minutes
+    return soak_times_s(leg, offset_s, stamps_ns) / 60
 
 
 def timing(legs: Sequence[Analysis]) -> bytes:
-    """Plot ticks, semantic delay, generations and the bridge's jitter over time; orange: a fault was active."""
+    """Plot ticks, semantic delay, generations and the bridge's jitter with trends; orange: a fault was active."""
     figure = new_figure(11.0, 8.4)
     axes = figure.subplots(4, 1, sharex=True)
     columns: list[list[tuple[Array, Array]]] = [[], [], [], []]
@@ -49,15 +44,28 @@ def timing(legs: Sequence[Analysis]) -> bytes:
         jitter = np.abs(np.array(leg["command_gap_ms"], float) - BRIDGE_PERIOD_MS)
         columns[3].append((_minutes(leg, offset_s, leg["command_ns"]), jitter))
     labels = ("tick, ms", "Δt, s", "generation, ms", "bridge jitter, ms")
-    for each, label, data in zip(axes, labels, columns, strict=True):
+    for each, label, data, name in zip(axes, labels, columns, SERIES, strict=True):
         _over_time(each, data)
+        _trend(each, legs, name)
         _mark(each, legs)
         each.set_ylabel(label, fontsize=9)
         each.set_ylim(bottom=0)
         tidy(each)
-    legend_above(axes[0])
     axes[-1].set_xlabel("minutes of the soak", fontsize=9)
     return png(figure)
+
+
+def _trend(axes: Axes, legs: Sequence[Analysis], name: str) -> None:
+    """Draw the trend of one of SERIES; its slope with the interval stands in the legend."""
+    at_s, values = windows(legs, SERIES[name])
+    line = trend(at_s, values)
+    if line is not None:
+        ends_s = at_s[[0, -1]]
+        unit = SERIES[name].unit
+        text = f"{name} each minute: {line.per_h:+.2g} [{line.low:+.2g}, {line.high:+.2g}] {unit} per hour"
+        axes.plot(ends_s / 60, line.begin + line.per_h * ends_s / 3600, color=TRUTH, linestyle="--", label=text)
+    if axes.get_legend_handles_labels()[0]:
+        legend_above(axes)
 
 
 def _over_time(axes: Axes, data: Sequence[tuple[Array, Array]]) -> None:

@@ -7,6 +7,7 @@ leg. All events are written to the leg's folder at once, so that a killed soak l
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -17,6 +18,7 @@ from typing import Any, Final, TextIO
 
 import psutil
 
+from edge.core.device import read_device
 from edge.run.say import SayError, say
 from sim_hil.realtime.children import StepError
 from sim_hil.realtime.stack import Stack, StackOptions
@@ -94,6 +96,7 @@ class Leg:
         stack = asdict(self.options.stack)
         about = {
             **asdict(self.options),
+            "machine": f"{os.cpu_count()} cores, {read_device('CPUExecutionProvider').device}",
             "stack": {
                 **stack,
                 "folder": folder.name,

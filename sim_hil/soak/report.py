@@ -50,7 +50,7 @@ def write_report(soak: SoakFolder, result: Mapping[str, Any]) -> Path:
         )
         if any(samples)
         else None,
-        faults=_faults(soak.legs),
+        faults=_faults(soak.legs, result["coverage"]),
         moments=_moments(soak),
         maps=_maps(soak.legs),
         stops=Table(("leg", "s", "attributed to", "the runner's message"), stops[:SHOWN_STOPS], frozenset({0, 1})),
@@ -146,7 +146,7 @@ def _value(found: Mapping[str, Any]) -> str:
     return f"{found['value']:g}{span} {found['unit']}".strip()
 
 
-def _faults(legs: Sequence[Mapping[str, Any]]) -> Table:
+def _faults(legs: Sequence[Mapping[str, Any]], coverage: Mapping[str, int]) -> Table:
     kinds: dict[str, list[Mapping[str, Any]]] = {}
     for leg in legs:
         for fault in leg["faults"]:
@@ -171,6 +171,7 @@ def _faults(legs: Sequence[Mapping[str, Any]]) -> Table:
                 "–" if points["max"] is None else f"{points['max']:.0f}",
             )
         )
+    rows += [(name, "0", "–", "–", "–", "–", "–") for name, count in coverage.items() if not count]
     head = ("fault", "n", "expected action", "raises", "raised", "p50 ms", "max ms")
     return Table(head, rows, numeric=frozenset({1, 4, 5, 6}))
 
@@ -227,7 +228,7 @@ def _stops(legs: Sequence[Mapping[str, Any]]) -> list[tuple[str | Cell, ...]]:
 
 
 def _legs(result: Mapping[str, Any]) -> Table:
-    head = ("leg", "scene", "s", "tasks", "reached", "collided", "stops", "faults", "ended by")
-    keys = ("number", "scene", "elapsed_s", "tasks", "reached", "collided", "stops", "faults", "why")
+    head = ("leg", "scene", "s", "tasks", "reached", "collided", "stops", "faults", "ended by", "machine")
+    keys = ("number", "scene", "elapsed_s", "tasks", "reached", "collided", "stops", "faults", "why", "machine")
     rows = [[str(leg[key]) for key in keys] for leg in result["legs"]]
     return Table(head, rows, numeric=frozenset({0, 2, 3, 4, 5, 6, 7}))

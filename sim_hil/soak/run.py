@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,7 +25,7 @@ from sim_hil.soak.analysis import ANALYSIS, analyse, keep_moments
 from sim_hil.soak.faults import FaultMenu, SoakInputError
 from sim_hil.soak.leg import LEG, SAMPLES, Leg, LegOptions
 from sim_hil.soak.tasks import Journey
-from sim_hil.soak.verdict import FAIL, PASS, UNDECIDED, BudgetLine, judge, measures
+from sim_hil.soak.verdict import FAIL, PASS, UNDECIDED, BudgetLine, is_lost, judge, measures
 
 CONFIG: Final = "config.json"
 LEGS: Final = "legs"
@@ -150,17 +151,22 @@ def run_legs(
     stopped: Callable[[], bool],
     show_status: PrintLine,
     log: PrintLine,
+    lost: Callable[[], str | None] = lambda: None,
     keep_logs: bool = False,
 ) -> bool:
-    """Run legs until the time is over; return False if `stopped` ended it.
+    """Run legs until the time is over; return False if `stopped` or `lost` ended it.
 
-    `show_status` gets a status line a few times a second, `log` a line per leg. Raises StepError after FAILED_LEGS.
+    `show_status` gets a status line a few times a second, `log` a line per leg. `lost`: asked before each leg; why
+    no later leg can meet the budget. Raises StepError after FAILED_LEGS.
     """
     failed = 0
     while not stopped():
         left_s = options.duration_s - soak.elapsed_s
         if left_s < SHORTEST_LEG_S:
             return True
+        if (reason := lost()) is not None:
+            log(reason)
+            return False
         number = 1 + max((leg["leg"]["number"] for leg in soak.legs), default=0)
         folder = soak.folder(number)
         folder.mkdir(parents=True, exist_ok=True)
@@ -209,11 +215,26 @@ def _stack_options(
     )
 
 
-def soak_result(
-    soak: SoakFolder, options: SoakOptions, budget: Sequence[BudgetLine], *, finished: bool
-) -> dict[str, Any]:
-    """Return the result for `--json`."""
+def lost_budget(soak: SoakFolder, budget: Sequence[BudgetLine]) -> str | None:
+    """Return in one line which budget line no later leg can meet; None while all can be met."""
     found = measures(soak.legs, soak.samples())
+    judged = [judge(line, found[line.measure]) for line in budget]
+    lost = [f"{line['measure']} is {line['found']['value']:g}, {limit_text(line)}" for line in judged if is_lost(line)]
+    return f"the budget is lost: {'; '.join(lost)}" if lost else None
+
+
+def limit_text(line: Mapping[str, Any]) -> str:
+    """Return the limit of a judged budget line."""
+    return f"at most {line['max']:g}" if "max" in line else f"at least {line['min']:g}"
+
+
+def soak_result(
+    soak: SoakFolder, options: SoakOptions, budget: Sequence[BudgetLine], menu: FaultMenu | None, *, finished: bool
+) -> dict[str, Any]:
+    """Return the result for `--json`; `coverage`: injections of every fault of the menu."""
+    names = [] if menu is None else [fault.name for fault in menu.faults]
+    found = measures(soak.legs, soak.samples(), names)
+    injected = Counter(fault["name"] for leg in soak.legs for fault in leg["faults"])
     judged = [judge(line, found[line.measure]) for line in budget]
     verdicts = {line["verdict"] for line in judged}
     lives = [life for leg in soak.legs for life in leg["lives"]]
@@ -248,6 +269,7 @@ def soak_result(
             **percentiles(watts, "p99"),
             "source": " and ".join(sources) or None,
         },
+        "coverage": {name: injected[name] for name in names},
         "faults": [end["cause"] or f"ended with code {end['code']}" for end in ends],
         "legs": [_leg_result(leg) for leg in soak.legs],
         "options": {**options.config(), "artifacts": str(options.artifacts)},
@@ -259,6 +281,7 @@ def _leg_result(leg: Mapping[str, Any]) -> dict[str, Any]:
     tasks = [task for task in leg["tasks"] if task["end"] != "cut"]
     return {
         "number": leg["leg"]["number"],
+        "machine": leg["leg"].get("machine", "unknown"),
         "scene": leg["leg"]["stack"]["scene"],
         "elapsed_s": leg["elapsed_s"],
         "why": leg["why"],

@@ -14,10 +14,13 @@ from scipy.stats import theilslopes
 from edge.core.stats import percentiles
 from sim_hil.scene.table import Table
 from sim_hil.soak.faults import SoakInputError, read_file
+from sim_hil.soak.trends import BRIDGE_PERIOD_MS, SERIES, trends
 
 DEFAULT_BUDGET: Final = Path(__file__).with_name("budget.toml")
 PASS, FAIL, UNDECIDED = "PASS", "FAIL", "UNDECIDED"
 FAULTS_UNANSWERED: Final = "faults_unanswered"
+GROWING: Final = ("stops", FAULTS_UNANSWERED, "log_records_dropped", "memory_slope", "descriptor_slope")
+"""Beginnings of the names of measures that no later leg can lower."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,13 @@ def judge(line: BudgetLine, measure: Measure) -> dict[str, Any]:
             verdict, why = UNDECIDED, "the interval includes the limit: run longer"
     limits = {key: value for key, value in vars(line).items() if value is not None}
     return {**limits, "verdict": verdict, **({"why": why} if why else {}), "found": measure.as_json()}
+
+
+def is_lost(judged: Mapping[str, Any]) -> bool:
+    """Return whether a failed line stays failed whatever follows: an extreme, a count, or the worst life's slope."""
+    name = str(judged["measure"])
+    only_grows = name.startswith(GROWING) or name.endswith(".max" if "max" in judged else ".min")
+    return judged["verdict"] == FAIL and only_grows
 
 
 def applicable(lines: tuple[BudgetLine, ...], *, faults: bool) -> tuple[BudgetLine, ...]:
@@ -133,7 +143,6 @@ def slope(times_s: Sequence[float], values: Sequence[float]) -> Slope | None:
 
 
 PROCESSES: Final = ("edge-run", "edge-bridge", "edge-hil")
-BRIDGE_PERIOD_MS: Final = 20.0  # rate_hz = 50 in the simulated robot's file
 MOVED_M: Final = 0.1
 """Least motion during a fault, m, for it to count among the faults that the runner must detect."""
 MIB: Final = 2.0**20
@@ -154,8 +163,8 @@ def process_lives(samples: Samples, name: str, key: str) -> list[tuple[list[floa
     return list(lives.values())
 
 
-def measures(legs: Sequence[Analysis], samples: Sequence[Samples]) -> dict[str, Measure]:
-    """Return every measure by name."""
+def measures(legs: Sequence[Analysis], samples: Sequence[Samples], menu: Sequence[str] = ()) -> dict[str, Measure]:
+    """Return every measure by name; `menu`: names of the faults that may be injected."""
     found: dict[str, Measure] = {}
     for name in PROCESSES:
         found[f"memory_slope_mib_per_h.{name}"] = _slope(samples, name, "rss_bytes", MIB, "MiB/h")
@@ -183,6 +192,13 @@ def measures(legs: Sequence[Analysis], samples: Sequence[Samples]) -> dict[str, 
     drift = [100 * error / path for leg in legs for error, path in leg["drift"]]
     _points(found, "drift_percent", drift, "% of the path", "p50", "p99", "max")
     _power(found, lives)
+    injected = {fault["name"] for leg in legs for fault in leg["faults"]}
+    covered = round(100 * len(injected & set(menu)) / len(menu), 1) if menu else None
+    found["faults_covered_percent"] = Measure(covered, "% of the menu", len(menu))
+    for name, line in trends(legs).items():
+        low, high = (None, None) if line is None else (round(line.low, 3), round(line.high, 3))
+        value, count = (None, 0) if line is None else (round(line.per_h, 3), line.number)
+        found[f"trend_per_h.{name}"] = Measure(value, f"{SERIES[name].unit}/h", count, low, high)
     gaps = [leg["nearest_person"][1] for leg in legs if leg["nearest_person"] is not None]
     found["nearest_person_m.min"] = Measure(min(gaps, default=None), "m", len(gaps))
     return found

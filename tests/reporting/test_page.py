@@ -12,8 +12,8 @@ from tests.support.html_page import HtmlPage
 def demo_page(**changed: object) -> str:
     table = Table(("", "name"), [])
     values: dict[str, object] = {
-        "title": "a page", "passed": True, "verdict": "", "instruction": "", "scene": "", "people": 0, "seed": 0,
-        "duration_s": 1.0, "untrained": False, "tiles": [], "maps": [], "cards": [], "histograms": [],
+        "title": "a page", "passed": True, "verdict": "", "instruction": "", "robot": "", "scene": "", "people": 0,
+        "seed": 0, "duration_s": 1.0, "untrained": False, "tiles": [], "maps": [], "cards": [], "histograms": [],
         "time_line": {"png": b"", "alt": "", "caption": "", "wide": False}, "checks": table, "numbers": table,
         "machine": None,
     }  # fmt: skip
@@ -40,7 +40,13 @@ def test_no_value_of_a_template_adds_a_tag() -> None:
     rows = [[evil, Cell(evil, "pass", note=evil)], [Cell(evil, link=evil), Cell(evil, "code")]]
     card = {"jpeg": None, "generation": 1, "meta": evil, "text": evil}
     page = demo_page(
-        title=evil, instruction=evil, scene=evil, tiles=[(evil, evil)], checks=Table((evil, evil), rows), cards=[card]
+        title=evil,
+        robot=evil,
+        instruction=evil,
+        scene=evil,
+        tiles=[(evil, evil)],
+        checks=Table((evil, evil), rows),
+        cards=[card],
     )
     assert "script" not in tags_of(page) and "\u202e" not in page
     assert "⟨U+202E⟩" in page

@@ -2,6 +2,7 @@
 
 python mavsdk_session.py PORT           listens on UDP PORT of the loopback, where the rover calls
 python mavsdk_session.py PORT --die     drives, then dies without a word
+python mavsdk_session.py PORT --watch   only watches, until its stdin ends
 """
 
 from __future__ import annotations
@@ -172,8 +173,52 @@ async def visit(rover: System) -> dict[str, Any]:
     return seen
 
 
+async def watch(port: int) -> dict[str, Any]:
+    rover = await connect(port)
+    modes: list[str] = []
+    texts: list[str] = []
+    armed: set[bool] = set()
+    speeds: list[float] = []
+
+    async def note_modes() -> None:
+        async for mode in rover.telemetry.flight_mode():
+            if not modes or modes[-1] != str(mode):
+                modes.append(str(mode))
+
+    async def note_armed() -> None:
+        async for value in rover.telemetry.armed():
+            armed.add(value)
+
+    async def note_speeds() -> None:
+        async for value in rover.telemetry.position_velocity_ned():
+            speeds.append(math.hypot(value.velocity.north_m_s, value.velocity.east_m_s))
+
+    noting = [asyncio.ensure_future(each) for each in (note_modes(), note_armed(), note_speeds())]
+    noting.append(asyncio.ensure_future(note_texts(rover, texts)))
+    sys.stderr.write("watching\n")
+    sys.stderr.flush()
+    try:
+        await asyncio.get_running_loop().run_in_executor(None, sys.stdin.read)
+        battery = await first(rover.telemetry.battery())
+    finally:
+        for each in noting:
+            each.cancel()
+        rover._stop_mavsdk_server()
+    return {
+        "modes": modes,
+        "armed": sorted(armed),
+        "reports": len(speeds),
+        "speed_max_mps": round(max(speeds, default=0.0), 3),
+        "battery_percent": round(battery.remaining_percent, 1),
+        "texts": texts,
+    }
+
+
 def main() -> int:
     port = int(sys.argv[1])
+    if "--watch" in sys.argv:
+        sys.stdout.write(json.dumps(asyncio.run(watch(port))) + "\n")
+        return 0
     if "--die" in sys.argv:
         asyncio.run(die(port))
     sys.stdout.write(json.dumps(asyncio.run(session(port))) + "\n")

@@ -36,6 +36,7 @@ from edge.deploy.doctor import machine as doctor_machine
 from edge.deploy.doctor import rights as doctor_rights
 from edge.deploy.doctor import robot as doctor_robot
 from edge.deploy.doctor import runtime as doctor_runtime
+from edge.deploy.doctor import topics as doctor_topics
 from edge.deploy.doctor.check import Check, Level, failed, skipped, table
 from edge.deploy.doctor.rights import UserRights, user_named
 from edge.deploy.unit_check import run_command
@@ -128,6 +129,8 @@ def examine(args: argparse.Namespace, root: Path = ROOT) -> Iterator[Check]:
     yield robot_check
     if robot is not None:
         yield from doctor_link.robot_links(robot, root, user)
+        if robot.ros2 is not None:
+            yield from doctor_topics.ros2_topics(robot)
         yield doctor_robot.bridge(robot)
         yield from doctor_robot.robot_link(robot, 448 if loaded is None else loaded.runtime.image_px)
 

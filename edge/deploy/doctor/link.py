@@ -33,7 +33,7 @@ def robot_links(robot: RobotConfig, root: Path, user: UserRights, run: Runner = 
     elif device is not None:
         yield serial_line(device, root, user)
     elif robot.can is not None and robot.can.interface == "socketcan":
-        yield can_interface(robot.can.channel, root, run)
+        yield can_interface(robot.can.channel, robot.can.bitrate_bps, root, run)
     elif robot.can is not None:
         yield skipped("CAN interface", f"{robot.can.interface} is a simulated bus")
     if robot.mavlink is not None:
@@ -77,11 +77,11 @@ def _default_routes(root: Path) -> list[str]:
     return [row[0] for row in fields if len(row) > 7 and row[1] == row[7] == "00000000"]
 
 
-def can_interface(channel: str, root: Path, run: Runner = run_command) -> Check:
-    """Whether the CAN interface is there, up and on the bus, and starts again by itself after a bus-off."""
+def can_interface(channel: str, bitrate_bps: int, root: Path, run: Runner = run_command) -> Check:
+    """Whether the CAN interface is up at the robot file's bitrate, and starts again by itself after a bus-off."""
     name, device = "CAN interface", root / "sys/class/net" / channel
-    expected = f"{channel} up, with a bitrate and restart-ms"
-    bring_up = f"sudo ip link set {channel} up type can bitrate BITRATE restart-ms 100 (BITRATE: that of the base)"
+    expected = f"{channel} up, with {bitrate_bps} bit/s and restart-ms"
+    bring_up = f"sudo ip link set {channel} up type can bitrate {bitrate_bps} restart-ms 100"
     try:
         kind, flags = (device / "type").read_text().strip(), int((device / "flags").read_text(), 16)
     except (OSError, ValueError):
@@ -99,14 +99,18 @@ def can_interface(channel: str, root: Path, run: Runner = run_command) -> Check:
     data = details.get("info_data") or {}
     bitrate, state = (data.get("bittiming") or {}).get("bitrate"), data.get("state", "unknown")
     found = f"{channel} is up, {bitrate} bit/s, {state}, restart-ms {data.get('restart_ms', 0)}"
+    again = bring_up.replace(" up ", f" down; sudo ip link set {channel} up ", 1)
+    if bitrate != bitrate_bps:
+        advice = f"the base, this interface and can.bitrate_bps need one bitrate: correct the robot file, or {again}"
+        return Check(name, Level.FAIL, found, expected, advice)
     if state == "BUS-OFF":
-        advice = "check bitrate, wiring and termination, then: " + bring_up.replace(" up ", " down; ", 1)
+        advice = f"check the base's bitrate, wiring and termination, then: {again}"
         return Check(name, Level.FAIL, found, expected, advice)
     if state == "ERROR-PASSIVE":
-        advice = "is the base on? check bitrate, wiring and termination (60 ohm between CAN_H and CAN_L)"
+        advice = "is the base on? check its bitrate, wiring and termination (60 ohm between CAN_H and CAN_L)"
         return Check(name, Level.WARN, found, expected, advice)
     if not data.get("restart_ms"):
-        advice = f"after a bus-off it stays off: sudo ip link set {channel} down; {bring_up}"
+        advice = f"after a bus-off it stays off: {again}"
         return Check(name, Level.WARN, found, expected, advice)
     return Check(name, Level.OK, found, expected)
 
@@ -151,7 +155,7 @@ def signing_key(key: Path | None, host: str, root: Path) -> Check:
     try:
         found = file.stat()
     except OSError as error:
-        advice = "create it as docs/robot.md shows, or run this as root"
+        advice = "create it as docs/your_robot.md shows, or run this as root"
         return Check(name, Level.FAIL, f"{key}: {error.strerror}", expected, advice)
     if found.st_mode & 0o077:
         advice = f"sudo chmod 0600 {key}, and make a new key: others may have read this one"

@@ -27,6 +27,7 @@ from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, Received
 from sim_hil.protocols.mavlink.autopilots import BY_NAME
 from sim_hil.protocols.mavlink.node import COMPONENT, Command, MavlinkNode
 from sim_hil.protocols.mavlink.parameters import Parameters
+from sim_hil.protocols.mavlink.setpoints import SetpointError, read_setpoint
 from sim_hil.protocols.mavlink.udp import PERFECT, Address, Impairment, UdpLink, parse_address
 from sim_hil.protocols.mavlink.vehicle import Station
 from sim_hil.protocols.mavlink.wire import Message, Reader, Verifier, Writer, now_ticks, read_key
@@ -162,26 +163,40 @@ class MavlinkFrontEnd(CameraFrontEnd):
 
     def _handle(self, message: Message, address: Address, received_ns: int) -> list[ReceivedCommand]:
         station = Station(message.get_srcSystem(), address)
-        if not self._node.receive(message, station, self._now_s):
-            return []
         number, name = message.get_msgId(), message.get_type()
+        requested = self._requested(message)
+        obeyed = self._node.receive(message, station, self._now_s)
+        if not obeyed and requested is None:
+            return []
         moves = not name.startswith("COMMAND") and name != "SET_MODE"
         if name.startswith("COMMAND"):
             command = Command.of(message)
             number, name = command.number, common.enums["MAV_CMD"][command.number].name
         wanted = self._node.vehicle.wanted() if self._node.vehicle.armed else None
-        self._log.last_command = name
-        if moves and wanted is not None:
-            self._log.move(name, (wanted[0], 0.0, wanted[1]))
-        self._log.at_zero = wanted is None or not any(wanted)
+        if obeyed:
+            self._log.last_command = name
+            if moves and wanted is not None:
+                self._log.move(name, (wanted[0], 0.0, wanted[1]))
+            self._log.at_zero = wanted is None or not any(wanted)
         content = " ".join(
             f"{key}={value}"
             for key, value in message.to_dict().items()
             if key not in _NOT_TRACED and value and value == value  # MAVSDK fills unused fields with NaN
         )
         velocity = (0.0, 0.0, 0.0) if wanted is None else (wanted[0], 0.0, wanted[1]) if moves else None
+        velocity = velocity if requested is None else requested
         text = f"station={station.system} {content}"
         return [ReceivedCommand(received_ns, "mavlink", number, name, text, velocity=velocity, source=station.system)]
+
+    def _requested(self, message: Message) -> tuple[float, float, float] | None:
+        """Return the velocity that a setpoint requests, also one that the rover does not obey; None without one."""
+        if message.get_msgId() != common.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED:
+            return None
+        try:
+            speed, rate = read_setpoint(message).command(self._node.vehicle.health.yaw_rad)
+        except SetpointError:
+            return None
+        return speed, 0.0, rate
 
     def publish(self, step: int, stamp_s: float) -> None:
         """Advance the rover's clock and send the messages that are due."""

@@ -1,8 +1,9 @@
 """State machine of the rover: control by one station, modes, arming, failsafes. Pure: no clock, no network.
 
 All times are the robot's own clock, s. One station is in control: the first that sends a request related to motion. It
-stays in control until it disarms the base or falls silent. Every station may receive reports and stop the base. The
-modes have PX4's numbers (px4_custom_mode.h).
+stays in control until it disarms the base or falls silent, or until another station changes the mode: PX4 and
+ArduPilot accept a mode from every station. Every station may receive reports and stop the base. The modes have PX4's
+numbers (px4_custom_mode.h).
 """
 
 from __future__ import annotations
@@ -60,6 +61,7 @@ def custom_mode_of(value: int) -> Mode | None:
 
 
 _COMMAND_S: Final = 0.02  # period at which a setpoint in the local frame is converted to the base's frame
+_NEVER_S: Final = -1e9
 _STOP: Final = (0.0, 0.0, 0.0)
 _SEVERITY_STOPPED: Final = common.MAV_SEVERITY_CRITICAL
 _SEVERITY_REFUSED: Final = common.MAV_SEVERITY_WARNING
@@ -113,11 +115,12 @@ class Vehicle:
         self.controller: Station | None = None
         self.refused_setpoints = 0
         self._heartbeats_s: dict[Station, float] = {}
+        self._offered_s: dict[Station, float] = {}  # a station's last setpoint, also one that was refused
         self._controller_s = 0.0
         self._setpoint: Setpoint | None = None
-        self._setpoint_s = -1e9
+        self._setpoint_s = _NEVER_S
         self._sticks: Sticks | None = None
-        self._sticks_s = -1e9
+        self._sticks_s = _NEVER_S
         self._station_lost = False
         self._next_command_s = 0.0
         self._texts: list[Text] = []
@@ -146,21 +149,27 @@ class Vehicle:
         loss_s = self._parameters["COM_DL_LOSS_T"]
         heartbeats = self._heartbeats_s.items()
         self._heartbeats_s = {station: at_s for station, at_s in heartbeats if now_s - at_s <= loss_s}
+        self._offered_s = {station: at_s for station, at_s in self._offered_s.items() if self._fresh(at_s, now_s)}
 
     def take_control(self, station: Station, now_s: float) -> bool:
         """Give `station` control if no other station has it; return whether it is in control."""
-        only = int(self._parameters["MAV_GCS_SYSID"])
-        if only not in (0, station.system):
+        if not self._is_permitted(station):
             return False
         if station == self.controller:
             return True
         if self.controller is not None and (self.armed or not self._silent(now_s)):
             return False
+        self._hand_over(station, now_s)
+        return True
+
+    def _is_permitted(self, station: Station) -> bool:
+        return int(self._parameters["MAV_GCS_SYSID"]) in (0, station.system)
+
+    def _hand_over(self, station: Station, now_s: float) -> None:
         self.controller = station
         self._controller_s = self._heartbeats_s.get(station, now_s)
         self._setpoint = self._sticks = None
         self._station_lost = False
-        return True
 
     def may_change(self, station: Station, now_s: float) -> bool:
         """Return whether `station` may change settings that the station in control relies on."""
@@ -224,14 +233,18 @@ class Vehicle:
         return ACCEPTED
 
     def set_mode(self, station: Station, mode: Mode | None, now_s: float) -> int:
-        """Set the mode, None for an unknown one; return MAV_RESULT."""
-        if not self.take_control(station, now_s):
+        """Set the mode, None for an unknown one; return MAV_RESULT. A station that changes the mode takes control."""
+        if not self._is_permitted(station):
             return self._refuse("Mode denied: another station is in control", REJECTED)
         if mode is None:
             return self._refuse("Mode denied: expected MANUAL, HOLD or OFFBOARD", DENIED)
-        if mode is Mode.OFFBOARD and not self._stays and not self._fresh(self._setpoint_s, now_s):
+        offered_s = self._offered_s.get(station, _NEVER_S)
+        if mode is Mode.OFFBOARD and not self._stays and not self._fresh(offered_s, now_s):
             return self._refuse("Offboard denied: no setpoints", REJECTED)
         if mode is not self.mode:
+            if not self.take_control(station, now_s):
+                self._hand_over(station, now_s)
+                self._setpoint_s = offered_s
             if mode is Mode.OFFBOARD:
                 self._sticks = None
             elif self.armed:
@@ -243,6 +256,7 @@ class Vehicle:
 
     def setpoint(self, station: Station, setpoint: Setpoint, now_s: float) -> bool:
         """Apply a setpoint; return whether it came from the station in control."""
+        self._offered_s[station] = now_s
         if not self.take_control(station, now_s):
             self.refused_setpoints += 1
             return False
@@ -311,7 +325,8 @@ class Vehicle:
     def _leave(self) -> None:
         self.mode = Mode.HOLD
         self._setpoint = self._sticks = None
-        self._setpoint_s = self._sticks_s = -1e9
+        self._setpoint_s = self._sticks_s = _NEVER_S
+        self._offered_s.clear()
 
     def _disarm(self, why: str, severity: int = _SEVERITY_NEWS) -> None:
         if self.armed:

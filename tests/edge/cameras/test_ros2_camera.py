@@ -163,7 +163,7 @@ def test_only_the_newest_picture_is_returned_and_once(shared: SharedBus) -> None
 
 
 def test_a_raw_topic_gives_jpegs(shared: SharedBus) -> None:
-    with closing(Ros2Camera(shared, "/image_raw", raw=True, best_effort=False)) as camera:
+    with closing(Ros2Camera(shared, "/image_raw", raw=True, reliable=True)) as camera:
         writer = shared.open().writer("rt/image_raw", Image_)
         found = frames_of(camera, lambda: writer.write(raw("rgb8", COLOUR)))
         assert decode_frame(found, 64)[0, 32, 32].tolist() == pytest.approx([200, 100, 30], abs=4)

@@ -26,7 +26,7 @@ import tools.bench.governor
 import tools.train.cli
 from edge import commands
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_REFUSED, OutputError, write_result
-from firmware_bridge import output_file
+from firmware_bridge.system import output_file
 
 ROOT = Path(__file__).parents[3]
 ROBOT = ROOT / "firmware_bridge" / "robots" / "go2.toml"

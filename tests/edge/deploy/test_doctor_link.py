@@ -24,7 +24,8 @@ from tests.edge.deploy.test_link_rights import robot as parts_of
 from tests.edge.run.test_robot_reader import robot_with
 from tests.support.processes import GO2_SIM
 
-CAN = {"state": "ERROR-ACTIVE", "restart_ms": 100, "bittiming": {"bitrate": 500000}}
+BITRATE_BPS = 500_000
+CAN = {"state": "ERROR-ACTIVE", "restart_ms": 100, "bittiming": {"bitrate": BITRATE_BPS}}
 STRANGER = UserRights("tic-vla-bridge", 4242, frozenset({4242}), other=True)
 
 
@@ -47,33 +48,35 @@ def ip_says(info: dict[str, Any], kind: str = "can") -> Callable[[Sequence[str]]
         ({"restart_ms": 0}, Level.WARN, "restart-ms 100"),
         ({"state": "ERROR-PASSIVE"}, Level.WARN, "is the base on"),
         ({"state": "BUS-OFF"}, Level.FAIL, "termination"),
+        ({"bittiming": {"bitrate": 250000}}, Level.FAIL, "correct the robot file, or sudo ip link set can0 down"),
+        ({"bittiming": {}}, Level.FAIL, "None bit/s"),
     ],
 )
 def test_a_can_interface_is_judged_by_its_state_and_its_restart(
     tmp_path: Path, change: dict[str, Any], level: Level, text: str
 ) -> None:
-    check = can_interface("can0", machine(tmp_path), ip_says({**CAN, **change}))
+    check = can_interface("can0", BITRATE_BPS, machine(tmp_path), ip_says({**CAN, **change}))
     assert check.level is level and text in check.found + check.advice
 
 
 def test_a_can_interface_that_is_down_or_absent_names_the_command(tmp_path: Path) -> None:
-    absent = can_interface("can0", tmp_path, ip_says(CAN))
-    down = can_interface("can0", machine(tmp_path, up=False), ip_says(CAN))
+    absent = can_interface("can0", BITRATE_BPS, tmp_path, ip_says(CAN))
+    down = can_interface("can0", BITRATE_BPS, machine(tmp_path, up=False), ip_says(CAN))
     for check in (absent, down):
         assert check.level is Level.FAIL and "sudo ip link set can0 up type can bitrate" in check.advice
 
 
 def test_another_kind_of_interface_is_refused(tmp_path: Path) -> None:
-    assert can_interface("can0", machine(tmp_path, kind=1), ip_says(CAN)).level is Level.FAIL
+    assert can_interface("can0", BITRATE_BPS, machine(tmp_path, kind=1), ip_says(CAN)).level is Level.FAIL
 
 
 def test_a_virtual_can_interface_needs_no_bitrate(tmp_path: Path) -> None:
-    assert can_interface("can0", machine(tmp_path), ip_says({}, "vcan")).level is Level.OK
+    assert can_interface("can0", BITRATE_BPS, machine(tmp_path), ip_says({}, "vcan")).level is Level.OK
 
 
 @pytest.mark.parametrize("answer", [(1, "Cannot find device"), (0, "no json"), (0, "[]"), (0, '[{"linkinfo": 7}]')])
 def test_without_an_answer_of_ip_the_bitrate_is_unknown(tmp_path: Path, answer: tuple[int, str]) -> None:
-    assert can_interface("can0", machine(tmp_path), lambda _words: answer).level is Level.WARN
+    assert can_interface("can0", BITRATE_BPS, machine(tmp_path), lambda _words: answer).level is Level.WARN
 
 
 @pytest.mark.parametrize("error", [FileNotFoundError("ip"), subprocess.TimeoutExpired("ip", 60)])
@@ -81,7 +84,7 @@ def test_a_machine_without_ip_is_no_crash(tmp_path: Path, error: Exception) -> N
     def fail(_words: Sequence[str]) -> tuple[int, str]:
         raise error
 
-    assert can_interface("can0", machine(tmp_path), fail).level is Level.WARN
+    assert can_interface("can0", BITRATE_BPS, machine(tmp_path), fail).level is Level.WARN
 
 
 def test_a_serial_line_must_be_a_device_that_the_user_may_open() -> None:

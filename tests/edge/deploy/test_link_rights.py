@@ -27,7 +27,7 @@ def robot(
     """A robot file's parts that decide about rights."""
     return SimpleNamespace(
         dds=None,
-        can=SimpleNamespace(interface=can, channel=channel) if can else None,
+        can=SimpleNamespace(interface=can, channel=channel, bitrate_bps=500_000) if can else None,
         mavlink=SimpleNamespace(link=mavlink, signing_key=key) if mavlink else None,
         camera=SimpleNamespace(source=source),
     )

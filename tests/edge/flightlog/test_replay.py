@@ -19,6 +19,7 @@ from edge.flightlog.reader import jpeg_bytes, read_messages
 from edge.flightlog.recorder import Recorder
 from edge.flightlog.replay.command import main
 from edge.flightlog.schemas import SCHEMAS
+from edge.flightlog.standard_schemas import STANDARD_SCHEMAS
 from edge.inference.generation_task import GenerationModels
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
@@ -120,6 +121,7 @@ def driven(artifacts_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> lis
     return [
         (topic, stamp_ns, jpeg_bytes(payload) if topic == "/camera" else payload)
         for topic, stamp_ns, payload in read_messages(path)
+        if topic in SCHEMAS
     ]
 
 
@@ -172,7 +174,7 @@ def test_a_run_of_both_loops_is_replayed_bit_for_bit(artifacts_dir: Path, tmp_pa
     drive(load_artifacts(artifacts_dir), recorder, mode)
     assert recorder.close() and recorder.dropped == {}
     for topic, _, payload in read_messages(tmp_path / "flight.mcap"):
-        assert complaints(payload, SCHEMAS[topic]) == []
+        assert complaints(payload, {**SCHEMAS, **STANDARD_SCHEMAS}[topic]) == []
     code, result = Log([], tmp_path / "flight.mcap", artifacts_dir).replay()
     assert code == 0, result
     assert result["ticks"] == {

@@ -1,4 +1,4 @@
-"""Reports of an autopilot in the bridge's axes, by laws: a motion forward, to the left and counterclockwise is positive."""
+"""Reports of an autopilot in the bridge's axes, by laws: forward, to the left and counterclockwise are positive."""
 
 from __future__ import annotations
 
@@ -73,9 +73,7 @@ def test_the_velocity_leads_to_the_next_pose(theta: float, v: float, w: float) -
         (0.0, 0.0, yaw),
         (v * math.cos(yaw) * step_s, v * math.sin(yaw) * step_s, yaw + yaw_rate * step_s),
     ):
-        motion = motion_of_odometry(
-            odometry(x=north, y=east, q=quaternion(0.0, 0.0, heading), vx=v, yawspeed=yaw_rate)
-        )
+        motion = motion_of_odometry(odometry(x=north, y=east, q=quaternion(0.0, 0.0, heading), vx=v, yawspeed=yaw_rate))
         assert motion is not None
         poses.append(SE2(*motion.T_odom_base))
     moved = poses[0].inverse() @ poses[1]
@@ -120,7 +118,8 @@ def test_an_unknown_charge_is_no_battery_report() -> None:
 @pytest.mark.parametrize(
     ("flags", "is_ekf", "good"),
     [(1 | 2 | 8, False, True), (1 | 2 | 16, True, True), (1 | 2, False, False), (2 | 8, False, False),
-     (1 | 2 | 8 | 128, False, False), (1 | 2 | 8 | 1024, True, False), (1 | 2 | 8 | 1024, False, True)],
+     (1 | 2 | 8 | 128, False, False), (1 | 2 | 8 | 1024, True, False), (1 | 2 | 8 | 1024, False, False),
+     (1 | 2 | 8 | 2048, False, False), (1 | 2 | 8 | 32768, True, False), (1 | 2 | 8 | 2048, True, True)],
 )  # fmt: skip
-def test_an_estimate_needs_attitude_velocity_and_position(flags: int, is_ekf: bool, good: bool) -> None:
+def test_an_estimate_needs_attitude_velocity_and_position_and_no_glitch(flags: int, is_ekf: bool, good: bool) -> None:
     assert is_estimate_good(flags, is_ekf=is_ekf) is good

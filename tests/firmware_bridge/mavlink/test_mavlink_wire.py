@@ -35,9 +35,12 @@ def signed(ticks: int = START_TICKS, key: bytes = KEY, link: int = 0) -> bytes:
     return bytes(attitude().pack(packer))
 
 
+NOISE = st.binary(max_size=40).filter(lambda data: not {0xFD, 0xFE} & set(data))
+
+
 class TestStream:
     @given(
-        noise=st.lists(st.binary(max_size=40).filter(lambda data: not {0xFD, 0xFE} & set(data)), min_size=4, max_size=4),
+        noise=st.lists(NOISE, min_size=4, max_size=4),
         cuts=st.lists(st.integers(1, 30), min_size=1),
     )
     @settings(max_examples=60, deadline=None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from sim_hil.soak.verdict import (
     BudgetLine,
     Measure,
     applicable,
+    is_lost,
     judge,
     load_budget,
     measures,
@@ -96,13 +98,47 @@ def test_a_soak_without_measurements_is_undecided_with_exit_code_1(
         tmp_path, "0" * 64, True, ("hospital",), 0, 0, 60.0, 60.0, 0.8, None, "async", "0", "none", 0, "go2", "default"
     )
     soak = SoakFolder.create(tmp_path / "out", options)
-    result = soak_result(soak, options, load_budget(DEFAULT_BUDGET), finished=True)
+    result = soak_result(soak, options, load_budget(DEFAULT_BUDGET), None, finished=True)
     assert {line["verdict"] for line in result["budget"]} == {UNDECIDED} == {result["verdict"]}
     assert cli.exit_code(result) == 1
     assert "no data: memory_slope_mib_per_h.edge-run, " in capsys.readouterr().err
     page = write_report(soak, result).read_text(encoding="utf-8")
     assert '<span class="verdict bad">UNDECIDED</span>' in page
     assert "no verdict: 12 of 12 budget lines are undecided" in page
+
+
+@pytest.mark.parametrize(
+    ("name", "limit", "value", "lost"),
+    [
+        ("stops_unexplained", {"max": 0.0}, 1.0, True),
+        ("memory_slope_mib_per_h.edge-run", {"max": 0.954}, 8.0, True),
+        ("tick_ms.max", {"max": 100.0}, 120.0, True),
+        ("real_time_factor.min", {"min": 0.98}, 0.9, True),
+        ("real_time_factor.min", {"max": 0.5}, 0.9, False),
+        ("tick_ms.p999", {"max": 100.0}, 120.0, False),
+        ("success_percent", {"min": 50.0}, 10.0, False),
+        ("stops_unexplained", {"max": 0.0}, 0.0, False),
+    ],
+)
+def test_a_failed_line_is_lost_only_if_no_later_leg_can_mend_it(
+    name: str, limit: dict[str, float], value: float, lost: bool
+) -> None:
+    assert is_lost(judge(BudgetLine(name, "here", **limit), Measure(value, "", 9))) is lost
+
+
+def test_an_undecided_slope_is_not_lost() -> None:
+    line = BudgetLine("memory_slope_mib_per_h.edge-run", "here", max=1.0)
+    assert not is_lost(judge(line, Measure(2.0, "MiB/h", 1, low=0.5, high=3.0)))
+
+
+def test_the_coverage_counts_the_kinds_of_the_menu_that_were_injected() -> None:
+    leg: dict[str, Any] = {key: [] for key in ("lives", "life_ends", "command_gap_ms", "command_ns", "tasks", "drift")}
+    leg |= {"real_time_factor": None, "nearest_person": None, "elapsed_s": 60.0, "begin_ns": 0}
+    fault = {"fault": "camera-frozen", "end_ns": 2, "moved_m": 1.0, "raised_ns": 1, "other_ns": None}
+    leg["faults"] = [{**fault, "name": "camera freezes"}, {**fault, "name": "camera freezes"}]
+    found = measures([leg], [[]], ["camera freezes", "camera stops"])
+    assert found["faults_covered_percent"].value == 50.0
+    assert measures([leg], [[]])["faults_covered_percent"].value is None
 
 
 @pytest.mark.parametrize(

@@ -67,13 +67,13 @@ def battery(share: float = 0.8) -> BatteryState_:
 class FakeRos2Base:
     """Publishes on the topics of the shipped robot file and keeps the received commands."""
 
-    def __init__(self, bus: Bus, *, stamped: bool = False) -> None:
+    def __init__(self, bus: Bus, *, stamped: bool = False, reliable: bool = True) -> None:
         self.bus = bus
-        self.odometry = bus.writer("rt/odom", Odometry_)
-        self.imu = bus.writer("rt/imu", Imu_)
-        self.battery = bus.writer("rt/battery_state", BatteryState_)
+        self.odometry = bus.writer("rt/odom", Odometry_, reliable=reliable)
+        self.imu = bus.writer("rt/imu", Imu_, reliable=reliable)
+        self.battery = bus.writer("rt/battery_state", BatteryState_, reliable=reliable)
         kind: Any = TwistStamped_ if stamped else Twist_
-        self._commands = bus.reader("rt/cmd_vel", kind, depth=100, reliable=True)
+        self._commands = bus.reader("rt/cmd_vel", kind, depth=100, reliable=reliable)
         self._stamp_ns = time.monotonic_ns()
 
     def report(self, **values: float) -> None:

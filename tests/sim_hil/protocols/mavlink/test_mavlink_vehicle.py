@@ -91,10 +91,30 @@ def test_a_second_station_may_not_drive_or_arm_or_disarm_it(vehicle: Vehicle, ba
         vehicle.heartbeat(other, 0.1)
         assert not vehicle.setpoint(other, Setpoint(False, -1.0, 0.0), 0.1)
         assert vehicle.arm(other, 0.1) == vehicle.disarm(other, 0.1) == REJECTED
-        assert vehicle.set_mode(other, Mode.MANUAL, 0.1) == REJECTED
         assert not vehicle.may_change(other, 0.1)
     vehicle.step(0.1)
     assert base.velocity[0] == 0.5 and vehicle.armed
+
+
+def test_a_mode_of_a_second_station_stops_it_and_refuses_the_first_ones_setpoints(
+    vehicle: Vehicle, base: FakeBase
+) -> None:
+    driving(vehicle)
+    vehicle.heartbeat(SECOND, 0.1)
+    assert vehicle.set_mode(SECOND, Mode.MANUAL, 0.1) == ACCEPTED and vehicle.controller == SECOND
+    assert not vehicle.setpoint(FIRST, AHEAD, 0.2)
+    vehicle.step(0.2)
+    assert not any(base.velocity) and vehicle.armed
+
+
+def test_the_first_station_drives_again_by_setpoints_and_a_mode_of_its_own(vehicle: Vehicle, base: FakeBase) -> None:
+    driving(vehicle)
+    vehicle.set_mode(SECOND, Mode.HOLD, 0.1)
+    vehicle.setpoint(FIRST, AHEAD, 0.2)
+    assert vehicle.set_mode(FIRST, Mode.OFFBOARD, 0.2) == ACCEPTED
+    vehicle.step(0.25)
+    vehicle.setpoint(FIRST, AHEAD, 0.3)
+    assert base.velocity[0] == 0.5
 
 
 def test_a_second_station_may_take_over_after_a_disarm(vehicle: Vehicle) -> None:

@@ -1,0 +1,97 @@
+"""How a soak's figures change with its time: one value a minute, and the line through them with its interval. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import theilslopes
+
+Array = NDArray[np.float64]
+Analysis = Mapping[str, Any]
+
+BRIDGE_PERIOD_MS: Final = 20.0  # rate_hz = 50 in the simulated robot's file
+WINDOW_S: Final = 60.0
+LEAST_WINDOWS: Final = 10
+
+
+def offsets_s(legs: Sequence[Analysis]) -> list[float]:
+    """Return each leg's start time, s since the soak began; legs may come from several machines."""
+    return [float(sum(leg["elapsed_s"] for leg in legs[:index])) for index in range(len(legs))]
+
+
+def soak_times_s(leg: Analysis, offset_s: float, stamps_ns: Sequence[int]) -> Array:
+    """Return stamps [n] of a leg as seconds of the soak."""
+    times: Array = (np.array(stamps_ns, float) - leg["begin_ns"]) / 1e9 + offset_s
+    return times
+
+
+@dataclass(frozen=True)
+class Series:
+    """One figure over time: `read` gives the stamps (ns) and values of a leg, `percentile` is that of a window."""
+
+    unit: str
+    percentile: float
+    read: Callable[[Analysis], tuple[list[int], list[float | None]]]
+
+
+class Trend(NamedTuple):
+    """Change per hour with its 95 % interval, the value at the soak's begin, and the number of windows."""
+
+    per_h: float
+    low: float
+    high: float
+    begin: float
+    number: int
+
+
+def _of_lives(stamps: str, values: str) -> Callable[[Analysis], tuple[list[int], list[float | None]]]:
+    def read(leg: Analysis) -> tuple[list[int], list[float | None]]:
+        lives = leg["lives"]
+        return [t for life in lives for t in life[stamps]], [v for life in lives for v in life[values]]
+
+    return read
+
+
+def _jitter(leg: Analysis) -> tuple[list[int], list[float | None]]:
+    return leg["command_ns"], [abs(gap - BRIDGE_PERIOD_MS) for gap in leg["command_gap_ms"]]
+
+
+SERIES: Final[Mapping[str, Series]] = {
+    "tick_ms.p99": Series("ms", 99, _of_lives("tick_ns", "tick_ms")),
+    "delay_s.p50": Series("s", 50, _of_lives("tick_ns", "delay_s")),
+    "generation_ms.p50": Series("ms", 50, _of_lives("ready_ns", "generation_ms")),
+    "bridge_jitter_ms.p99": Series("ms", 99, _jitter),
+}
+"""Figures whose trend is drawn and may stand in a budget."""
+
+
+def windows(legs: Sequence[Analysis], series: Series) -> tuple[Array, Array]:
+    """Return (middle of each window with data, s of the soak; its value)."""
+    found: list[tuple[Array, Array]] = []
+    for leg, offset_s in zip(legs, offsets_s(legs), strict=True):
+        stamps, values = series.read(leg)
+        found.append((soak_times_s(leg, offset_s, stamps), np.array([np.nan if v is None else v for v in values])))
+    at = np.concatenate([times for times, _ in found]) if found else np.array([])
+    values_all = np.concatenate([each for _, each in found]) if found else np.array([])
+    good = np.isfinite(values_all)
+    where = np.floor(at[good] / WINDOW_S)
+    indices = np.unique(where)
+    reduced = [float(np.percentile(values_all[good][where == index], series.percentile)) for index in indices]
+    return (indices + 0.5) * WINDOW_S, np.array(reduced)
+
+
+def trend(at_s: Array, values: Array) -> Trend | None:
+    """Return the Theil-Sen line through `values` [n] at `at_s` [n]; None below LEAST_WINDOWS values."""
+    if len(values) < LEAST_WINDOWS:
+        return None
+    per_s, begin, low, high = (float(v) for v in theilslopes(values, at_s, 0.95))
+    return Trend(3600 * per_s, 3600 * low, 3600 * high, begin, len(values))
+
+
+def trends(legs: Sequence[Analysis]) -> dict[str, Trend | None]:
+    """Return the trend of every series."""
+    return {name: trend(*windows(legs, series)) for name, series in SERIES.items()}

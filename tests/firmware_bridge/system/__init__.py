@@ -1,0 +1,1 @@
+"""Tests of what the bridge asks of its operating system: files, log and watchdog."""

@@ -1,0 +1,55 @@
+"""Trends of a soak: one value a minute over legs of any machines, and the line through them with its interval."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sim_hil.soak.trends import SERIES, trend, trends, windows
+
+S = 1_000_000_000
+
+
+def leg(begin_ns: int, minutes: int, first_ms: float, per_minute_ms: float) -> dict[str, Any]:
+    """A leg with ten noisy ticks a minute."""
+    at_s = np.arange(0, minutes * 60, 6)
+    noise = np.random.default_rng(begin_ns % 97).normal(0, 0.2, len(at_s))
+    tick_ms = [first_ms + per_minute_ms * t / 60 + float(each) for t, each in zip(at_s, noise, strict=True)]
+    life = {"tick_ns": [begin_ns + int(t) * S for t in at_s], "tick_ms": tick_ms, "delay_s": [None] * len(at_s)}
+    life |= {"ready_ns": [], "generation_ms": []}
+    return {"begin_ns": begin_ns, "elapsed_s": 60.0 * minutes, "lives": [life], "command_ns": [], "command_gap_ms": []}
+
+
+def test_a_growth_over_legs_of_two_machines_is_one_line() -> None:
+    found = trends([leg(5 * S, 20, 10.0, 0.1), leg(900_000 * S, 20, 12.0, 0.1)])["tick_ms.p99"]
+    assert found is not None
+    assert found.number == 40
+    assert found.per_h == pytest.approx(6.0, rel=0.1)
+    assert found.low < 6.0 < found.high
+
+
+def test_a_constant_figure_has_an_interval_around_zero() -> None:
+    found = trends([leg(S, 40, 10.0, 0.0)])["tick_ms.p99"]
+    assert found is not None and found.low < 0.0 < found.high
+
+
+def test_a_short_soak_and_one_without_values_have_no_trend() -> None:
+    short = trends([leg(S, 9, 10.0, 0.0)])
+    assert set(short.values()) == {None}
+
+
+def test_a_minute_without_values_is_left_out() -> None:
+    first, second = leg(S, 5, 10.0, 0.0), leg(S, 5, 10.0, 0.0)
+    first["elapsed_s"] = 600.0  # five minutes without a runner
+    at_s, values = windows([first, second], SERIES["tick_ms.p99"])
+    assert len(at_s) == len(values) == 10
+    assert at_s[5] - at_s[4] == pytest.approx(360.0)
+
+
+def test_outliers_do_not_bend_a_trend() -> None:
+    values = np.full(40, 10.0)
+    values[[3, 30]] = 500.0
+    found = trend(np.arange(40) * 60.0, values)
+    assert found is not None and found.per_h == pytest.approx(0.0, abs=1e-9)
