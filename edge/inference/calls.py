@@ -40,6 +40,13 @@ def chunks(segments: Sequence[Segment], *, size: int, image_id: int) -> list[Chu
     return result
 
 
+def set_first_apart(chunk: Chunk, image_id: int) -> list[Chunk]:
+    """Return the same chunk with its text before the first placeholder of a frame in a separate one."""
+    count = chunk.ids.index(image_id) if image_id in chunk.ids else 0
+    rest = Chunk(chunk.ids[count:], chunk.tokens, chunk.image_offset)
+    return [Chunk(chunk.ids[:count], None, 0), rest] if count else [rest]
+
+
 def set_last_apart(prompt: Sequence[Chunk]) -> list[Chunk]:
     """Return the same prompt with its last token, which is text, in a separate chunk."""
     *head, tail = prompt

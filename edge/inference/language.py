@@ -18,7 +18,7 @@ from tokenizers import Tokenizer
 from edge.artifacts.files import ArtifactError
 from edge.artifacts.manifest import MOST_ROWS, Artifacts
 from edge.core.geometry import SE2
-from edge.inference.calls import Call, Chunk, Floats, chunks, set_last_apart
+from edge.inference.calls import Call, Chunk, Floats, chunks, set_first_apart, set_last_apart
 from edge.inference.graph import DTYPES, CancelledError, Graph, Interrupt, zeros
 from edge.inference.scheduling import Schedule, run_as
 from edge.inference.speculation import FIRST_TEXT, LEAST_ROWS, Speculator, TextUnderWay, exact_calls_ns, next_rows
@@ -114,6 +114,8 @@ class LanguageModel:
         self._graphs, self._buffers = graphs, buffers
         self.rows: tuple[int, ...] = (LEAST_ROWS,)
         """Permitted numbers of rows of a call that chooses tokens, ascending."""
+        self.kept_ids: tuple[int, ...] = ()
+        """Prompt tokens before the first frame whose rows the buffers hold, from position 0."""
         self.speculator: Speculator | None = None
         """Guesses the next tokens; None: one new token a call."""
         self.ends_line = cache(lambda token: self.text_of([token]).endswith("\n"))
@@ -245,7 +247,7 @@ class GenerationRun:
         """Prefill the next part of the prompt; leave at least one segment for `finish`."""
         started_ns = time.monotonic_ns()
         for chunk in self._cut(segments):
-            self._run(self._model.prefill_call, chunk)
+            self._prefill(chunk)
         self._prefill_ns += time.monotonic_ns() - started_ns
 
     def finish(
@@ -256,7 +258,7 @@ class GenerationRun:
         started_ns = time.monotonic_ns()
         *head, last = set_last_apart(self._cut(segments))
         for chunk in head:
-            self._run(model.prefill_call, chunk)
+            self._prefill(chunk)
         prompt_tokens = self._fed + 1
         # One position is left for the padding of the last call.
         limit = min(max_new_tokens, runtime.max_context - prompt_tokens - 1)
@@ -345,11 +347,24 @@ class GenerationRun:
         tokens = self._fed + sum(len(segment.ids) for segment in segments)
         if tokens > runtime.max_context:
             raise ContextOverflowError(f"prompt of {tokens} tokens, the model reads {runtime.max_context}")
-        return chunks(segments, size=runtime.prefill_chunk_tokens, image_id=runtime.img_context_id)
+        cut = chunks(segments, size=runtime.prefill_chunk_tokens, image_id=runtime.img_context_id)
+        if self._fed == 0:
+            # Instruction and system text get calls of their own, so that the next generation can keep their rows.
+            cut = [*set_first_apart(cut[0], runtime.img_context_id), *cut[1:]]
+        return cut
 
-    def _run(self, call: Call, chunk: Chunk) -> None:
-        self._call(call, chunk)
-        self._fed += len(chunk.ids)
+    def _prefill(self, chunk: Chunk) -> None:
+        """Feed a chunk of the prompt, unless the previous generation has left the same rows at the same positions.
+
+        Equal calls after equal rows give equal bits, so that a kept row equals a computed one.
+        """
+        model, start, end = self._model, self._fed, self._fed + len(chunk.ids)
+        if model.kept_ids[start:end] != chunk.ids:
+            model.kept_ids = model.kept_ids[:start]
+            self._call(model.prefill_call, chunk)
+            if chunk.tokens is None and len(model.kept_ids) == start:
+                model.kept_ids += chunk.ids
+        self._fed = end
 
     def _call(self, call: Call, chunk: Chunk) -> list[int]:
         if self._before_call is not None:

@@ -52,6 +52,7 @@ def decode_script(
     tail = language.prompt.tail((), context.before)
     lines = [ids_of(language, line) for line in text.splitlines(keepends=True)]
     script = Script([*lines[:-1], [*lines[-1], language.runtime.im_end_id]], len(tail.ids))
+    language.kept_ids = ()
     language.prefill_call = language.decode_call = cast("Call", script)
     constraint = language.constraint(context)
     made = language.generate([tail], max_new_tokens=most, cancelled=lambda: False, constraint=constraint)
