@@ -87,6 +87,7 @@ class RobotInputs:
         self._log_odometry, self._log_battery = Throttle(ODOMETRY_LOG_HZ), Throttle(BATTERY_LOG_HZ)
         self._newest: OdometryOutputs | None = None
         self._link = LinkMonitor()
+        self._has_driven = False
         mount = robot.mount
         self._eye: VisualOdometry | None = None
         if mount is not None:
@@ -144,6 +145,9 @@ class RobotInputs:
         self.states += 1
         now_ns = time.monotonic_ns()
         commanded = self._commanded()
+        if commanded is not None and not self._has_driven:
+            # Some robots change the rate of their reports when the bridge connects: that is no loss.
+            self._has_driven, self._link = True, LinkMonitor()
         outputs = self._newest = self.estimator.step(
             OdometryInputs(
                 received_ns=state.received_ns,

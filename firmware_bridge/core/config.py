@@ -159,8 +159,9 @@ def load_robot_config(path: Path | str, *, socket: Path | None = None, domain: i
                 require(key not in safety, f"unknown key safety.{key}: only protocol unitree has it")
         config: RobotConfig = _build(RobotConfig, table, "")
         dds = config.dds if domain is None else replace(config.network, domain=domain)
+        can = None if config.can is None else config.can.with_files_of(Path(path).absolute().parent)
         bridge = config.bridge if socket is None else replace(config.bridge, socket=socket.absolute())
-        return replace(config, dds=dds, bridge=bridge)
+        return replace(config, dds=dds, can=can, bridge=bridge)
     except ConfigError as error:
         raise ConfigError(f"robot file {path}: {error}") from error
 

@@ -12,10 +12,11 @@ from pathlib import Path
 import pytest
 
 from edge.flightlog.recorder import space_refusal
+from sim_hil.realtime.robots import ROBOTS as STACK_ROBOTS
 from sim_hil.realtime.stack import socket_dir
 from tools.faults.__main__ import run_row
 from tools.faults.host_stall import HostStall
-from tools.faults.rig import Rig
+from tools.faults.rig.processes import Rig
 from tools.faults.rows import rows
 
 pytestmark = pytest.mark.process
@@ -55,4 +56,32 @@ def rig(artifacts_dir: Path, dds_domain: int, host: HostStall) -> Iterator[Rig]:
 )
 def test_the_robot_is_stopped_within_the_rows_bound(name: str, rig: Rig, host: HostStall) -> None:
     result = run_row(rig, ROWS[name], 1, random.Random(name), host)
+    assert not result.problems, result.as_json()
+
+
+@pytest.fixture(scope="module")
+def rover(artifacts_dir: Path, host: HostStall) -> Iterator[Rig]:
+    with (
+        socket_dir() as folder,
+        Rig(folder, artifacts_dir, None, print, record=False, stack_robot=STACK_ROBOTS["carter-mavlink"]) as rig,
+    ):
+        rig.start()
+        yield rig
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    [
+        "unsigned packets",
+        "packets with another key",
+        "recorded packets again",
+        "packets of another system",
+        "pilot's mode switch",
+        "second commander",
+    ],
+)
+def test_a_rover_on_a_signed_link_keeps_the_rows_bound(name: str, rover: Rig, host: HostStall) -> None:
+    (row,) = [row for row in rows(rover.stack_robot) if row.name == name]
+    result = run_row(rover, row, 1, random.Random(name), host)
     assert not result.problems, result.as_json()

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import argparse
 import fnmatch
+import json
+import os
 import random
 import signal
 import sys
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
@@ -31,13 +34,13 @@ from edge.core.cli import (
 from edge.flightlog.recorder import space_refusal
 from sim_hil.protocols.fault_socket import FaultError
 from sim_hil.realtime.children import StepError, uninterrupted
-from sim_hil.realtime.robots import GO2, ROBOTS
+from sim_hil.realtime.robots import GO2, ROBOTS, StackRobot
 from sim_hil.realtime.stack import socket_dir
 from tools.faults.host_stall import HostStall
 from tools.faults.measure import Sample, injection
-from tools.faults.report import RowResult, result, show
-from tools.faults.rig import Rig
-from tools.faults.rows import Judge, Row, rows
+from tools.faults.report import RowResult, markdown, read_results, result, show
+from tools.faults.rig.processes import Rig
+from tools.faults.rows import CONTRACT, Judge, Row, rows
 from tools.report.machine import machine_facts
 
 _print = messages("faults")
@@ -45,6 +48,8 @@ _print = messages("faults")
 EXAMPLES = """examples:
   python -m tools.faults --artifacts out/nano --out out/faults
   python -m tools.faults --artifacts out/nano --out out/faults --rows "camera*" --rows "runner SIG*" --per-row 20
+  python -m tools.faults --robot carter-can --contract --per-row 20 --artifacts out/nano --out out/contract/carter-can
+  python -m tools.faults --table out/contract/go2 out/contract/carter-can
   python -m tools.faults --list
 exit codes: 0 every bound held, 1 a bound did not hold or an injection failed, 2 bad arguments, 130 interrupted"""
 
@@ -66,14 +71,23 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--seed", type=int, default=0, help="seed of the injection times (default: 0)")
     p.add_argument("--robot", choices=tuple(ROBOTS), default=GO2.name, help=f"robot to drive (default: {GO2.name})")
     p.add_argument("--domain", type=int, metavar="N", help="DDS domain of a robot with DDS (default: a free one)")
+    p.add_argument(
+        "--contract", action="store_true", help="only the rows of the table of backends and faults, all N times"
+    )
+    p.add_argument("--resume", action="store_true", help="keep the rows that --out already has in full")
+    p.add_argument(
+        "--table", nargs="+", type=Path, metavar="DIR", help="print the results in these folders as a table, and exit"
+    )
     p.add_argument("--list", action="store_true", help="print the rows with their criteria and exit")
     p.add_argument("--json", metavar="FILE|-", help="also write the result to this file; - is stdout")
     return p
 
 
-def chosen(globs: Sequence[str] | None) -> list[Row]:
-    """Return the rows whose names match. Raises ValueError if a pattern matches none."""
-    everything = rows()
+def chosen(globs: Sequence[str] | None, robot: StackRobot = GO2, *, contract: bool = False) -> list[Row]:
+    """Return the robot's rows whose names match. Raises ValueError if a pattern matches none."""
+    everything = rows(robot)
+    if contract:
+        everything = tuple(replace(row, share=1.0) for row in everything if row.name in CONTRACT)
     for glob in globs or ():
         if not any(fnmatch.fnmatch(row.name, glob) for row in everything):
             raise ValueError(f"--rows {glob!r}: no such row; see --list")
@@ -100,7 +114,7 @@ def run_row(rig: Rig, row: Row, times: int, rng: random.Random, host: HostStall)
             _show(row, f"{index + 1}/{times} again", sample)
             sample.wrong += sample.hindered
         samples.append(sample)
-    return RowResult(row, samples, repeated)
+    return RowResult(row, samples, repeated, round(os.getloadavg()[0], 1))
 
 
 def attempt(rig: Rig, row: Row, rng: random.Random, host: HostStall) -> Sample:
@@ -128,8 +142,10 @@ def run(args: argparse.Namespace, wanted: Sequence[Row]) -> list[RowResult]:
 
     Raises StepError if no flight could be recorded, FaultError if edge-hil does not answer.
     """
-    results: list[RowResult] = []
-    robot = ROBOTS[args.robot]
+    robot, file = ROBOTS[args.robot], args.out / "faults.json"
+    kept = read_results(file, rows(robot)) if args.resume else []
+    results = [one for one in kept if len(one.samples) >= count(one.row, args.per_row)]
+    done = {one.row.name for one in results}
     with ExitStack() as stack:
         folder = stack.enter_context(socket_dir())
         refusal = space_refusal(folder / "flight.mcap")
@@ -142,8 +158,9 @@ def run(args: argparse.Namespace, wanted: Sequence[Row]) -> list[RowResult]:
         rig.start()
         rng = random.Random(args.seed)
         for row in wanted:
-            results.append(run_row(rig, row, count(row, args.per_row), rng, host))
-            write_result(str(args.out / "faults.json"), result(results, machine_facts()))
+            if row.name not in done:
+                results.append(run_row(rig, row, count(row, args.per_row), rng, host))
+                write_result(str(file), result(results, machine_facts(), robot.name))
     return results
 
 
@@ -163,10 +180,13 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     args = parser().parse_args(argv)
     try:
-        wanted = chosen(args.rows)
+        wanted = chosen(args.rows, ROBOTS[args.robot], contract=args.contract)
         check_result_target(args.json)
         if args.per_row < 1:
             raise ValueError(f"--per-row {args.per_row}: expected at least 1")
+        if args.table is not None:
+            print(markdown([json.loads((folder / "faults.json").read_text("utf-8")) for folder in args.table]))
+            return EXIT_DONE
         if not args.list and (args.artifacts is None or not args.artifacts.is_dir()):
             raise ValueError(f"--artifacts {args.artifacts}: expected a directory made by edge-export")
         args.out.mkdir(parents=True, exist_ok=True)
@@ -183,10 +203,10 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         _print(f"interrupted, all processes ended; the results so far are in {args.out}")
         return EXIT_INTERRUPTED
-    except (StepError, FaultError, OSError) as error:
+    except (StepError, FaultError, OSError, ValueError) as error:
         _print(str(error))
         return EXIT_CHECK_FAILED
-    summary = result(results, machine_facts())
+    summary = result(results, machine_facts(), args.robot)
     write_result(args.json, summary)
     show(results, Console(stderr=args.json == "-", width=150))
     return EXIT_DONE if summary["pass"] else EXIT_CHECK_FAILED

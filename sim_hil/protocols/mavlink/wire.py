@@ -109,6 +109,10 @@ class Writer:
             self._packer.signing.sign_outgoing = True
             self._packer.signing.timestamp = now_ticks
 
+    def advance(self, now_ticks: int) -> None:
+        """Set the clock of the signatures, which never goes back: a reader refuses a stream a minute behind its own."""
+        self._packer.signing.timestamp = max(self._packer.signing.timestamp, now_ticks)
+
     def pack(self, message: Message) -> bytes:
         """Return a message as bytes."""
         data = bytes(message.pack(self._packer))
