@@ -1,13 +1,15 @@
 """Speculative decoding against one new token a call: equal bits, acceptance, tokens per call, duration.
 
     python -m tools.bench.speculation --artifacts out/nano --episodes 'office-*-0-*' --json out/bench/speculation.json
+    python -m tools.bench.speculation --artifacts out/nano --prompts out/bench/prompts
     python -m tools.bench.speculation --artifacts out/1b --texts out/bench/speculation.json --rounds 7
 
 The first form drives benchmark episodes in virtual time. Each generation is decoded three times, in turn: with one row
 a call (`single`), with one new token a call and the row of padding that makes speculation exact (`plain`), and with
-guesses (`guessing`). The second form decodes the first one's texts with other graphs, such as the paper's size with
-random weights: each choice is replaced by the text's token, so the calls are those of a trained model. Exit code 1 when
-`plain` and `guessing` differ in a token, a key or a value, 2 for bad input.
+guesses (`guessing`). `--save DIR` keeps its prompts, which the second form decodes again. The third form decodes the
+first one's texts with other graphs, such as the paper's size with random weights: each choice is replaced by the text's
+token, so the calls are those of a trained model. Exit code 1 when `plain` and `guessing` differ in a token, a key or a
+value, 2 for bad input.
 
 CPU times are of the calling thread, which computes everything: they also compare on a busy machine.
 """
@@ -18,7 +20,7 @@ import json
 import statistics
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -29,11 +31,14 @@ from edge.artifacts.files import ArtifactError
 from edge.artifacts.manifest import Artifacts, load_artifacts
 from edge.core.cli import EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
 from edge.core.geometry import SE2
+from edge.inference.calls import Floats
 from edge.inference.language import Generation, LanguageModel
 from edge.inference.latency_profile import LatencyProfile
-from edge.reasoning.decoding_rules import DecodingContext, Line, TextConstraint
+from edge.reasoning.decoding_rules import DecodingContext, Line, TextConstraint, TurnDistances
 from edge.reasoning.prompt import EXAMPLE_BEFORE, EXAMPLE_PAST_PATH, Segment
+from edge.state.reasoning_text import Progress
 from edge.state.ring import EncodedFrame
+from edge.state.switches import Decoding, SwitchOptions
 from sim_hil.benchmark.env.world import EpisodeWorld, WorldOptions
 from sim_hil.benchmark.policies.artifacts_policy import ArtifactsPolicy
 from sim_hil.benchmark.policies.select import robot_config
@@ -135,6 +140,7 @@ class _Recorded:
         self._variants = variants
         plain = variants.models["plain"]
         self.prompt, self.runtime, self.check_instruction = plain.prompt, plain.runtime, plain.check_instruction
+        self.prompts = Prompts()
         self._segments: list[Segment] = []
         self._context = DecodingContext()
 
@@ -151,6 +157,7 @@ class _Recorded:
 
     def finish(self, segments: Sequence[Segment], *, max_new_tokens: int, constraint: TextConstraint) -> Generation:
         plain = self._variants.models["plain"]
+        self.prompts.put([*self._segments, *segments], self._context, max_new_tokens)
 
         def work(model: LanguageModel) -> Generation:
             rules = constraint if model is plain else model.constraint(self._context)
@@ -160,6 +167,56 @@ class _Recorded:
             return run.finish(segments, max_new_tokens=max_new_tokens, constraint=rules)
 
         return self._variants.decode(work)
+
+
+class Prompts:
+    """Recorded prompts of one episode: a JSON file of texts and rules, and a file of visual tokens."""
+
+    def __init__(self) -> None:
+        self.records: list[dict[str, Any]] = []
+        self.frames: list[Floats] = []
+
+    def put(self, segments: Sequence[Segment], context: DecodingContext, max_new_tokens: int) -> None:
+        """Take the prompt of a generation."""
+        parts = []
+        for segment in segments:
+            parts.append({"ids": list(segment.ids), "frame": None if segment.tokens is None else len(self.frames)})
+            if segment.tokens is not None:
+                self.frames.append(segment.tokens.copy())
+        before = None if context.before is None else asdict(context.before)
+        rules = {**context.record(), "before": before}
+        self.records.append({"segments": parts, "rules": rules, "max_new_tokens": max_new_tokens})
+
+    def save(self, path: Path) -> None:
+        """Write PATH.json and PATH.npz."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.with_suffix(".json").write_text(json.dumps(self.records), encoding="utf-8")
+        np.savez(path.with_suffix(".npz"), frames=np.array(self.frames))
+
+    @staticmethod
+    def decode(path: Path, variants: Variants) -> None:
+        """Decode what `save` wrote in every variant. Raises ArtifactError."""
+        try:
+            frames = np.load(path.with_suffix(".npz"))["frames"]
+            for record in json.loads(path.read_text(encoding="utf-8")):
+                segments = [
+                    Segment(tuple(part["ids"]), None if part["frame"] is None else frames[part["frame"]])
+                    for part in record["segments"]
+                ]
+                context, most = _context(record["rules"]), int(record["max_new_tokens"])
+                variants.decode(
+                    lambda model, segments=segments, context=context, most=most: model.generate(  # type: ignore[misc]
+                        segments, max_new_tokens=most, cancelled=lambda: False, constraint=model.constraint(context)
+                    )
+                )
+        except (ValueError, KeyError, TypeError, IndexError) as error:
+            raise ArtifactError(f"{path}: expected prompts that --save wrote ({error!r})") from error
+
+
+def _context(rules: Mapping[str, Any]) -> DecodingContext:
+    before = None if rules["before"] is None else Progress(**rules["before"])
+    turn = None if rules["turn"] is None else TurnDistances(rules["turn"], tuple(rules["turn_left_m"]))
+    return DecodingContext(before, rules["follow"], turn, rules["turn_may_be_done"])
 
 
 class _ForcedText:
@@ -178,21 +235,22 @@ class _ForcedText:
         return None
 
 
-def drive(variants: Variants, artifacts: Path, episodes: Sequence[Episode], decoding: str) -> None:
-    """Drive the episodes with `plain`, one second of latency a generation."""
-    from edge.state.switches import Decoding, SwitchOptions
-
+def drive(variants: Variants, artifacts: Path, episodes: Sequence[Episode], decoding: str, save: Path | None) -> None:
+    """Drive the episodes with `plain`, one second of latency a generation; write their prompts below `save`."""
     switches = SwitchOptions(decoding=Decoding(decoding))
     for episode in episodes:
         policy = ArtifactsPolicy(
             artifacts, mode="async", latency=LatencyProfile.constant(1.0), robot=robot_config(), switches=switches
         )
-        policy.language = cast("LanguageModel", _Recorded(variants))
+        recorded = _Recorded(variants)
+        policy.language = cast("LanguageModel", recorded)
         world = EpisodeWorld(episode, WorldOptions(camera=policy.camera))
         policy.reset(episode, episode.instructions[0], None, episode.seed)
         while not world.done:
             world.step(policy.act(world.observe()))
         world.close()
+        if save is not None:
+            recorded.prompts.save(save / episode.id)
         sys.stderr.write(f"speculation: {episode.id}: {len(variants.texts)} generations so far\n")
 
 
@@ -223,6 +281,8 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("--suite", default="dynanav", metavar="NAME|FILE", help="suite of the episodes (default: dynanav)")
     p.add_argument("--episodes", nargs="+", default=["*"], metavar="GLOB", help="episodes to drive (default: all)")
     p.add_argument("--decoding", choices=("free", "constrained"), default="constrained")
+    p.add_argument("--save", type=Path, metavar="DIR", help="write the prompts of the episodes there")
+    p.add_argument("--prompts", type=Path, metavar="DIR", help="prompts that --save wrote: decode them instead")
     p.add_argument("--texts", type=Path, metavar="FILE", help="a result of this command: decode its texts instead")
     p.add_argument("--first", type=int, default=0, metavar="N", help="skip so many of its texts (default: 0)")
     p.add_argument("--count", type=int, default=8, metavar="N", help="decode so many of its texts (default: 8)")
@@ -233,13 +293,16 @@ def main(argv: list[str] | None = None) -> int:
         if args.rounds < 1 or args.count < 1 or args.first < 0:
             raise ArtifactError("--rounds and --count must be 1 or more, --first 0 or more")
         texts = None if args.texts is None else _texts(args.texts)[args.first : args.first + args.count]
-        episodes = choose(load_suite(args.suite), args.episodes) if texts is None else []
+        driven = texts is None and args.prompts is None
+        episodes = choose(load_suite(args.suite), args.episodes) if driven else []
         variants = Variants(load_artifacts(args.artifacts))
+        for path in [] if args.prompts is None else sorted(args.prompts.glob("*.json")):
+            Prompts.decode(path, variants)
     except (ArtifactError, SuiteError, OSError) as error:
         return bad_input("speculation", error)
-    if texts is None:
-        drive(variants, args.artifacts, episodes, args.decoding)
-    else:
+    if driven:
+        drive(variants, args.artifacts, episodes, args.decoding, args.save)
+    if texts is not None:
         force(variants, texts, args.rounds)
     if not variants.texts:
         return bad_input("speculation", ValueError("no generation was decoded: expected episodes or texts with some"))
