@@ -182,11 +182,13 @@ class LanguageModel:
         first = self.tokenizer.encode(FIRST_TEXT, add_special_tokens=False).ids
         written = self.generate(prompt, max_new_tokens=MOST_ROWS, cancelled=lambda: False)
         call = Call(self._graphs[-1], self._buffers, with_logits=True)
-        # Attention sums over the context: check it at its full length as well.
-        full, usual = (
-            exact_calls_ns(call, self._kv, past, first[:MOST_ROWS])
-            for past in (self.runtime.max_context - MOST_ROWS, written.prompt_tokens)
-        )
+        usual = exact_calls_ns(call, self._kv, written.prompt_tokens, first[:MOST_ROWS])
+        # Attention sums over the context: check it at its full length as well, on rows that were computed.
+        end, most = self.runtime.max_context - MOST_ROWS, self.runtime.prefill_chunk_tokens
+        for start in range(written.prompt_tokens, end, most):
+            filler = (first * most)[: min(most, end - start)]
+            self.prefill_call(Chunk(tuple(filler), None, 0), start, self._kv, None)
+        full = exact_calls_ns(call, self._kv, end, first[:MOST_ROWS])
         call_ns = {rows: took_ns for rows, took_ns in usual.items() if rows in full}
         if LEAST_ROWS not in call_ns:
             self.rows = (1,)
