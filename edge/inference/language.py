@@ -17,9 +17,10 @@ from tokenizers import Tokenizer
 
 from edge.artifacts.files import ArtifactError
 from edge.artifacts.manifest import MOST_ROWS, Artifacts
+from edge.artifacts.tokenizer_file import MAX_TOKENS
 from edge.core.geometry import SE2
 from edge.inference.calls import Call, Chunk, Floats, chunks, set_first_apart, set_last_apart
-from edge.inference.graph import DTYPES, CancelledError, Graph, Interrupt, zeros
+from edge.inference.graph import DTYPES, CancelledError, Graph, GraphError, Interrupt, zeros
 from edge.inference.scheduling import Schedule, run_as
 from edge.inference.speculation import FIRST_TEXT, LEAST_ROWS, Speculator, TextUnderWay, exact_calls_ns, next_rows
 from edge.reasoning.decoding_rules import DecodingContext, TextConstraint
@@ -66,6 +67,17 @@ class Generation:
         return len(self.token_ids)
 
 
+def _open_tokenizer(content: bytes) -> Tokenizer:
+    """Open a checked tokenizer.json; raises ArtifactError."""
+    try:
+        return Tokenizer.from_buffer(content)
+    except (KeyboardInterrupt, SystemExit):
+        raise
+    except BaseException as error:  # a panic of the library is no Exception
+        reason = (str(error).splitlines() or [""])[0][:160]
+        raise ArtifactError(f"tokenizer.json: not a tokenizer ({reason}); export again") from error
+
+
 class LanguageModel:
     """Prefill and greedy decoding over KV buffers that are allocated once."""
 
@@ -76,22 +88,23 @@ class LanguageModel:
         threads: int | None = None,
         provider: str | None = None,
         schedule: Schedule | None = None,
+        interrupt: Interrupt | None = None,
     ) -> None:
-        """`schedule`: where the graphs' own threads run and how urgently."""
+        """`schedule`: where the graphs' own threads run and how urgently.
+
+        `interrupt` ends every call that is given none of its own.
+        """
         runtime = artifacts.runtime
         role = schedule.reasoning if schedule else None
         cores = role.cores if role else ()
         graphs = run_as(
             role,
             lambda: [
-                Graph(artifacts, name, threads=threads, provider=provider, cores=cores)
+                Graph(artifacts, name, threads=threads, provider=provider, cores=cores, interrupt=interrupt)
                 for name in artifacts.language_graphs
             ],
         )
-        try:
-            self.tokenizer = Tokenizer.from_buffer(artifacts.contents["tokenizer.json"])
-        except Exception as error:
-            raise ArtifactError(f"tokenizer.json: not a tokenizer ({error})") from error
+        self.tokenizer = _open_tokenizer(artifacts.contents["tokenizer.json"])
         self.runtime = runtime
         ids = PromptIds(
             runtime.im_start_id, runtime.im_end_id, runtime.img_start_id, runtime.img_end_id, runtime.img_context_id
@@ -203,9 +216,12 @@ class LanguageModel:
         return None
 
     def run(self, call: Call, chunk: Chunk, past: int, interrupt: Interrupt | None) -> list[int]:
-        """Feed a chunk after `past` tokens; return what `Call` does."""
+        """Feed a chunk after `past` tokens; return what `Call` does. Raises GraphError."""
+        self.kept_ids = self.kept_ids[:past]
         started_ns = time.monotonic_ns()
         next_ids = call(chunk, past, self._kv, interrupt)
+        if not all(0 <= token < MAX_TOKENS for token in next_ids):
+            raise GraphError(f"the language model's next tokens are {next_ids}, expected ids of its vocabulary")
         self._took_ns[len(chunk.ids)] = time.monotonic_ns() - started_ns
         return next_ids
 
@@ -362,7 +378,6 @@ class GenerationRun:
         """
         model, start, end = self._model, self._fed, self._fed + len(chunk.ids)
         if model.kept_ids[start:end] != chunk.ids:
-            model.kept_ids = model.kept_ids[:start]
             self._call(model.prefill_call, chunk)
             if chunk.tokens is None and len(model.kept_ids) == start:
                 model.kept_ids += chunk.ids

@@ -1,4 +1,4 @@
-"""Warms up every graph before the robot may move, and refuses ticks that are far too slow."""
+"""Opens, proves and warms up every graph before the robot may move, and refuses ticks that are far too slow."""
 
 from __future__ import annotations
 
@@ -14,6 +14,9 @@ from edge.artifacts.manifest import Artifacts
 from edge.core.geometry import SE2
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
+from edge.inference.scheduling import Schedule, TickActivity
+from edge.inference.self_test import SelfTestResult, check_answers
+from edge.inference.start_guard import OPEN_S, StartGuard
 from edge.state.ring import EncodedFrame
 from edge.state.semantic import STRAIGHT_AHEAD, SemanticState
 from edge.state.switches import Speculation
@@ -31,6 +34,34 @@ class WarmUp:
     """Median duration of warm ticks, ms (graphs only)."""
     notes: tuple[str, ...]
     """Lines for the operator."""
+
+
+@dataclass(frozen=True)
+class Opened:
+    """The model's graphs, opened within limits and proven by the self-test."""
+
+    policy: Policy
+    language: LanguageModel
+    tested: SelfTestResult
+    guard: StartGuard
+    """Limits of the rest of the start."""
+
+
+def open_proven(
+    artifacts: Artifacts,
+    *,
+    schedule: Schedule | None = None,
+    activity: TickActivity | None = None,
+    guard: StartGuard | None = None,
+) -> Opened:
+    """Open every graph on the provider that ships and run the self-test; raises ArtifactError."""
+    guard = guard or StartGuard(artifacts)
+    with guard.stage("opening the graphs", OPEN_S):
+        policy = Policy(artifacts, schedule=schedule, activity=activity, interrupt=guard.interrupt)
+        language = LanguageModel(artifacts, schedule=schedule, interrupt=guard.interrupt)
+    known = artifacts.known_answers
+    with guard.stage("self-test", OPEN_S if known is None else known.limit_s):
+        return Opened(policy, language, check_answers(policy, language, known), guard)
 
 
 def warm_up(policy: Policy, language: LanguageModel, speculation: Speculation) -> WarmUp:

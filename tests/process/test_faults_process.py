@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from edge.flightlog.recorder import space_refusal
-from sim_hil.realtime.robots import ROBOTS as STACK_ROBOTS
+from sim_hil.realtime.robots import ROBOTS
 from sim_hil.realtime.stack import socket_dir
 from tools.faults.__main__ import run_row
 from tools.faults.host_stall import HostStall
@@ -28,6 +28,33 @@ ROWS = {row.name: row for row in rows()}
 def host() -> Iterator[HostStall]:
     with HostStall() as watching:
         yield watching
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)
+@pytest.mark.parametrize(
+    ("robot", "names"),
+    [
+        (
+            "carter-can",
+            ("bridge SIGKILL", "bus-off", "every frame corrupted", "second commander", "link dead both ways"),
+        ),
+        ("carter-mavlink", ("bridge SIGKILL", "link dead both ways")),
+        ("carter-ros2", ("bridge SIGKILL", "second commander", "link dead both ways")),
+    ],
+)
+def test_a_wheeled_base_is_stopped_within_the_rows_bound(
+    robot: str, names: tuple[str, ...], artifacts_dir: Path, host: HostStall
+) -> None:
+    of = {row.name: row for row in rows(ROBOTS[robot])}
+    with (
+        socket_dir() as folder,
+        Rig(folder, artifacts_dir, None, print, record=False, stack_robot=ROBOTS[robot]) as rig,
+    ):
+        rig.start()
+        for name in names:
+            result = run_row(rig, of[name], 1, random.Random(name), host)
+            assert not result.problems, (name, result.as_json())
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +90,7 @@ def test_the_robot_is_stopped_within_the_rows_bound(name: str, rig: Rig, host: H
 def rover(artifacts_dir: Path, host: HostStall) -> Iterator[Rig]:
     with (
         socket_dir() as folder,
-        Rig(folder, artifacts_dir, None, print, record=False, stack_robot=STACK_ROBOTS["carter-mavlink"]) as rig,
+        Rig(folder, artifacts_dir, None, print, record=False, stack_robot=ROBOTS["carter-mavlink"]) as rig,
     ):
         rig.start()
         yield rig

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import math
 import random
+import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -21,7 +23,7 @@ from sim_hil.realtime.robots import ROBOTS, StackRobot
 from tools.faults import __main__ as command
 from tools.faults.measure import Sample
 from tools.faults.report import RowResult, markdown, read_results, result
-from tools.faults.rig import circle
+from tools.faults.rig import circle, driver
 from tools.faults.rig.received import ReceivedCommands, first_lasting, longest_age_ms, longest_gap_ms
 from tools.faults.rig.switches import Switches
 from tools.faults.rows import CONTRACT, NOT_INJECTED, Judge, Row, rows
@@ -252,3 +254,38 @@ def test_a_robot_that_does_not_drive_on_fails_a_row_only_twice_in_a_row(
     result = command.run_row(rig, row(), 1, random.Random(0), None)  # type: ignore[arg-type]
     assert result.repeated == repeated and (not result.problems) == passes
     assert len(result.samples) == 1 + repeated
+
+
+class FakeBridge:
+    """A bridge that needs an operator, arms in the third step and stops the robot in the sixth."""
+
+    def __init__(self, _path: Path) -> None:
+        self.polls, self.arms = 0, 0
+        self.velocities: list[tuple[float, float]] = []
+
+    def poll(self) -> SimpleNamespace:
+        self.polls += 1
+        state = "disarmed" if self.polls < 3 else "armed" if self.polls < 6 else "stopped"
+        return SimpleNamespace(state=state, reason="bus-off", permit="needed")
+
+    def arm(self) -> None:
+        self.arms += 1
+
+    def send_velocity(self, _seq: int, _stamp_ns: int, vx_mps: float, _vy_mps: float, wz_radps: float) -> None:
+        self.velocities.append((vx_mps, wz_radps))
+
+
+@pytest.mark.parametrize(("age_s", "drives"), [(0.0, True), (0.6, False)])
+def test_the_runners_stand_in_drives_from_a_fresh_pose_once_armed_until_the_bridge_stops_it(
+    age_s: float, drives: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bridge = FakeBridge(Path())
+    state = SimpleNamespace(received_ns=time.monotonic_ns() - round(age_s * 1e9), T_odom_base=(1.0, 0.0, math.pi / 2))
+    monkeypatch.setattr(driver, "BridgeClient", lambda _path: bridge)
+    monkeypatch.setattr(driver, "_reader", lambda _config: SimpleNamespace(state=lambda: state))
+    monkeypatch.setattr(driver, "_PERIOD_NS", 1_000_000)
+    config = SimpleNamespace(bridge=SimpleNamespace(socket="bridge"))
+    assert driver.drive(config) == "bus-off"  # type: ignore[arg-type]
+    assert bridge.arms == 1 and capsys.readouterr().err == "driver: waiting for `edge-bridge arm`\n"
+    assert bridge.velocities[:2] == [(0.0, 0.0)] * 2 and len(bridge.velocities) == 5
+    assert all((vx > 0.5 and wz > 0.3) == drives for vx, wz in bridge.velocities[2:])
