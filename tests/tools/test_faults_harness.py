@@ -9,6 +9,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -138,6 +139,17 @@ def test_a_resumed_call_reads_the_rows_that_it_had_written(tmp_path: Path) -> No
     (tmp_path / "faults.json").write_text("[]")
     with pytest.raises(ValueError, match="leave out --resume"):
         read_results(tmp_path / "faults.json", rows())
+
+
+def test_a_resumed_row_makes_only_the_missing_injections(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[int] = []
+    monkeypatch.setattr(command, "attempt", lambda *_: made.append(1) or Sample(50.0, 0.0))
+    counts: list[int] = []
+    kept = RowResult(row(), [Sample(100.0, 0.0)] * 3, 1)
+    arguments: tuple[Any, ...] = (None, row(), 5, random.Random(0), None)
+    done = command.run_row(*arguments, kept=kept, keep=lambda one: counts.append(len(one.samples)))
+    assert len(made) == 2 and counts == [4, 5] and len(done.samples) == 5 and done.repeated == 1
+    assert len(command.run_row(*arguments, kept=done).samples) == 5 and len(made) == 2
 
 
 def test_the_table_has_a_row_for_each_fault_and_a_column_for_each_robot() -> None:
