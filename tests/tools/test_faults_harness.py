@@ -16,6 +16,7 @@ import pytest
 from edge.core.geometry import SE2
 from edge.motion.controller import arc_to
 from edge.safety.faults.table import FAULTS
+from firmware_bridge.core.config import load_robot_config
 from sim_hil.protocols.can.node import COMMAND_TIMEOUT_S
 from sim_hil.protocols.fault_socket import FaultClient, FaultError
 from sim_hil.protocols.mavlink.parameters import TABLE
@@ -128,6 +129,14 @@ def test_the_timeout_that_a_row_expects_of_a_robot_is_the_simulated_ones() -> No
     assert ROBOTS["carter-can"].own_timeout_s == COMMAND_TIMEOUT_S
     assert ROBOTS["carter-mavlink"].own_timeout_s == TABLE["COM_OF_LOSS_T"].default
     assert ROBOTS["carter-ros2"].own_timeout_s == BASE_TIMEOUT_S
+
+
+def test_a_robot_stops_by_itself_no_later_than_its_robot_file_states() -> None:
+    can, ros2, mavlink = (load_robot_config(ROBOTS[f"carter-{name}"].file) for name in ("can", "ros2", "mavlink"))
+    assert can.can is not None and ros2.ros2 is not None and mavlink.mavlink is not None
+    assert 1000 * ROBOTS["carter-can"].own_timeout_s <= can.can.command.base_timeout_ms
+    assert 1000 * ROBOTS["carter-ros2"].own_timeout_s <= ros2.ros2.base_timeout_ms
+    assert ROBOTS["carter-mavlink"].own_timeout_s <= mavlink.mavlink.setpoint_loss_max_s
 
 
 def test_a_resumed_call_reads_the_rows_that_it_had_written(tmp_path: Path) -> None:
