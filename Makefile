@@ -72,14 +72,14 @@ nano: .venv/.demo-installed
 
 # The demo's artifacts, if they are there; otherwise its own.
 faults: .venv/.demo-installed
-	@test -f out/demo/artifacts/manifest.json || $(BIN)/edge-export --target cpu --model nano --random-weights 0 --out out/demo/artifacts
+	@grep -qs '"schema_version": 4' out/demo/artifacts/manifest.json || $(BIN)/edge-export --target cpu --model nano --random-weights 0 --out out/demo/artifacts
 	@$(BIN)/python -m tools.faults --robot $(ROBOT) --artifacts out/demo/artifacts --out out/faults
 
 # One robot: make contract ROBOTS=carter-can. A second call keeps the rows that are there; OUT=DIR writes elsewhere.
 ROBOTS = go2 carter-can carter-mavlink carter-ros2
 OUT = out/contract
 contract: .venv/.demo-installed
-	@test -f out/demo/artifacts/manifest.json || $(BIN)/edge-export --target cpu --model nano --random-weights 0 --out out/demo/artifacts
+	@grep -qs '"schema_version": 4' out/demo/artifacts/manifest.json || $(BIN)/edge-export --target cpu --model nano --random-weights 0 --out out/demo/artifacts
 	@failed=0; for robot in $(ROBOTS); do \
 		$(BIN)/python -m tools.faults --robot $$robot --contract --resume --per-row 20 --artifacts out/demo/artifacts --out $(OUT)/$$robot; \
 		code=$$?; case $$code in 0) ;; 1) failed=1;; *) exit $$code;; esac; \

@@ -26,11 +26,27 @@ COMMANDS: Final = {
 
 
 def run(command: str) -> int:
-    """Run a command and return its exit code. Without torch, `edge-export verify` checks what needs no torch."""
+    """Run a command and return its exit code.
+
+    Without torch, `edge-export verify` checks what needs no torch. Only the page of `edge-replay explain` needs
+    more than the robot has.
+    """
     module, extra = COMMANDS[command]
+    if command == "edge-replay":
+        module, extra = replay_module(sys.argv[1:])
     if command == "edge-export" and sys.argv[1:2] == ["verify"] and importlib.util.find_spec("torch") is None:
         module = "edge.deploy.doctor.verify"
     return run_with_extra(command, module, extra)
+
+
+def replay_module(arguments: list[str]) -> tuple[str, str]:
+    """Return module and extra of `edge-replay` with its sub-commands."""
+    with_page = any(each.startswith("--page") for each in arguments)
+    if arguments[:1] == ["explain"]:
+        return ("tools.report.explain_page", "export") if with_page else ("edge.flightlog.explain.command", "")
+    if arguments[:1] == ["video"]:
+        return "edge.flightlog.explain.video", ""
+    return COMMANDS["edge-replay"]
 
 
 edge_run = partial(run, "edge-run")

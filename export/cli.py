@@ -24,7 +24,9 @@ from edge.core.cli import (
     EXIT_INTERRUPTED,
     check_result_target,
     command_line,
+    describe_os_error,
     named_file,
+    printable,
     write_result,
 )
 from export.core.cache import StageCache, default_cache_dir, open_cache
@@ -117,7 +119,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _log(line: str) -> None:
-    sys.stderr.write(f"{COMMAND}: {line}\n")
+    sys.stderr.write(f"{COMMAND}: {printable(line)}\n")
 
 
 def _target_and_config(args: argparse.Namespace) -> tuple[Target, TicVlaConfig]:
@@ -268,7 +270,8 @@ def _main(args: argparse.Namespace, started_ns: int) -> int:
         _log(str(error) if args.command == "verify" or args.dry_run else f"{error}; nothing was written")
         return EXIT_CHECK_FAILED
     except (UsageError, *BAD_INPUT) as error:
-        _log(str(error))
+        places = f"{args.directory or args.out or 'output'} (or the cache)"
+        _log(describe_os_error(error, places) if isinstance(error, OSError) else str(error))
         # An artifact that does not verify is a failed check; anything else here is bad input.
         return EXIT_CHECK_FAILED if args.command == "verify" and isinstance(error, ArtifactError) else EXIT_BAD_INPUT
     except KeyboardInterrupt:

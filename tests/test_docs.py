@@ -21,7 +21,7 @@ else:
 ROOT = next(folder for folder in Path(__file__).resolve().parents if (folder / "pyproject.toml").is_file())
 PAGES = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md")))
 FOLDERS = sorted({"docs", "tests", *(path.parent.name for path in ROOT.glob("*/__init__.py"))})
-NESTED = {"edge-install", "edge-calib", "edge-bench"}
+NESTED = {"edge-install", "edge-calib", "edge-bench", "edge-replay"}
 """Commands whose subcommands have parsers of their own."""
 MAX_README_LINES = 120
 

@@ -120,11 +120,21 @@ def _named(what: object) -> Iterator[None]:
         raise OutputError(f"{what}: cannot be written: {error.strerror or error}") from error
 
 
+def describe_os_error(error: OSError, what: str) -> str:
+    """Return one line about an error of a file; `what` names the file where the error does not, as a full disk's."""
+    return str(error) if error.filename is not None or not error.strerror else f"{what}: {error.strerror}"
+
+
+def printable(text: str) -> str:
+    """Return text that a terminal only shows: control characters, as in a name of a file's content, are escaped."""
+    return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
 def messages(name: str) -> Callable[[str], None]:
     """Return a function that writes `name: line` to standard error at once."""
 
     def write(line: str) -> None:
-        sys.stderr.write(f"{name}: {line}\n")
+        sys.stderr.write(f"{name}: {printable(line)}\n")
         sys.stderr.flush()
 
     return write
@@ -159,7 +169,7 @@ def command_line(
             except (OutputError, OSError) as error:
                 if isinstance(error, OSError) and error.errno not in (errno.ENOSPC, errno.EPIPE):
                     raise
-                report(str(error))
+                report(describe_os_error(error, "an output") if isinstance(error, OSError) else str(error))
                 _give_up_stdout()
                 return EXIT_CHECK_FAILED
 

@@ -170,6 +170,16 @@ SCHEMAS: Mapping[str, Schema] = {
         voltage_v=_NUMBER_OR_NULL,
         current_a=_NUMBER_OR_NULL,
     ),
+    "/truth": _record(
+        "tic_vla.Truth",  # only where a simulator knows it
+        ("route_m", "route_bearing_rad", "clearance_m"),
+        pose=_VECTOR,  # x m, y m, θ rad in the world
+        people=_ROWS,  # (x m, y m, heading rad) of those within 10 m
+        touching={"type": "array", "items": _TEXT},  # labels of what the robot touches
+        route_m=_NUMBER_OR_NULL,  # length of the shortest path to the goal
+        route_bearing_rad=_NUMBER_OR_NULL,  # direction of its point 3 m ahead, seen from the robot
+        clearance_m=_NUMBER_OR_NULL,  # to the nearest object
+    ),
     "/result": {"title": "tic_vla.Result", "type": "object"},
 }
 

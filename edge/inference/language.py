@@ -13,8 +13,9 @@ from tokenizers import Tokenizer
 
 from edge.artifacts.files import ArtifactError
 from edge.artifacts.manifest import Artifacts
+from edge.artifacts.tokenizer_file import MAX_TOKENS
 from edge.core.geometry import SE2
-from edge.inference.graph import DTYPES, CancelledError, Graph, Interrupt, zeros
+from edge.inference.graph import DTYPES, CancelledError, Graph, GraphError, Interrupt, zeros
 from edge.inference.scheduling import Schedule, run_as
 from edge.reasoning.decoding_rules import DecodingContext, TextConstraint
 from edge.reasoning.prompt import LONGEST_BEFORE, LONGEST_PAST_PATH, InstructionError, PromptBuilder, PromptIds, Segment
@@ -112,6 +113,17 @@ class Call:
         return int(self._next_token[0, 0])
 
 
+def _open_tokenizer(content: bytes) -> Tokenizer:
+    """Open a checked tokenizer.json; raises ArtifactError."""
+    try:
+        return Tokenizer.from_buffer(content)
+    except (KeyboardInterrupt, SystemExit):
+        raise
+    except BaseException as error:  # a panic of the library is no Exception
+        reason = (str(error).splitlines() or [""])[0][:160]
+        raise ArtifactError(f"tokenizer.json: not a tokenizer ({reason}); export again") from error
+
+
 class LanguageModel:
     """Prefill and greedy decoding over KV buffers that are allocated once."""
 
@@ -122,22 +134,23 @@ class LanguageModel:
         threads: int | None = None,
         provider: str | None = None,
         schedule: Schedule | None = None,
+        interrupt: Interrupt | None = None,
     ) -> None:
-        """`schedule`: where the graphs' own threads run and how urgently."""
+        """`schedule`: where the graphs' own threads run and how urgently.
+
+        `interrupt` ends every call that is given none of its own.
+        """
         runtime = artifacts.runtime
         role = schedule.reasoning if schedule else None
         cores = role.cores if role else ()
         graphs = run_as(
             role,
             lambda: [
-                Graph(artifacts, name, threads=threads, provider=provider, cores=cores)
+                Graph(artifacts, name, threads=threads, provider=provider, cores=cores, interrupt=interrupt)
                 for name in artifacts.language_graphs
             ],
         )
-        try:
-            self._tokenizer = Tokenizer.from_buffer(artifacts.contents["tokenizer.json"])
-        except Exception as error:
-            raise ArtifactError(f"tokenizer.json: not a tokenizer ({error})") from error
+        self._tokenizer = _open_tokenizer(artifacts.contents["tokenizer.json"])
         self.runtime = runtime
         ids = PromptIds(
             runtime.im_start_id, runtime.im_end_id, runtime.img_start_id, runtime.img_end_id, runtime.img_context_id
@@ -203,9 +216,11 @@ class LanguageModel:
         return GenerationRun(self, cancelled, interrupt, before_call)
 
     def run(self, call: Call, chunk: Chunk, past: int, interrupt: Interrupt | None) -> int:
-        """Feed a chunk after `past` tokens; return the next id (0 from a graph without one)."""
+        """Feed a chunk after `past` tokens; return the next id (0 from a graph without one). Raises GraphError."""
         started_ns = time.monotonic_ns()
         next_id = call(chunk, past, self._kv, interrupt)
+        if not 0 <= next_id < MAX_TOKENS:
+            raise GraphError(f"the language model's next token is {next_id}, expected an id of its vocabulary")
         self._took_ns[len(chunk.ids)] = time.monotonic_ns() - started_ns
         return next_id
 

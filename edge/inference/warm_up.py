@@ -1,9 +1,10 @@
-"""Warms up every graph before the robot may move, and refuses ticks that are far too slow."""
+"""Opens, proves and warms up every graph before the robot may move, and refuses ticks that are far too slow."""
 
 from __future__ import annotations
 
 import statistics
 import time
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -13,12 +14,43 @@ from edge.artifacts.manifest import Artifacts
 from edge.core.geometry import SE2
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
+from edge.inference.scheduling import Schedule, TickActivity
+from edge.inference.self_test import SelfTestResult, check_answers
+from edge.inference.start_guard import OPEN_S, StartGuard
 from edge.state.ring import EncodedFrame
 from edge.state.semantic import STRAIGHT_AHEAD, SemanticState
 
 COLD_TICKS: Final = 5
 """Pay for first-time allocation."""
 WARM_TICKS: Final = 20
+
+
+@dataclass(frozen=True)
+class Opened:
+    """The model's graphs, opened within limits and proven by the self-test."""
+
+    policy: Policy
+    language: LanguageModel
+    tested: SelfTestResult
+    guard: StartGuard
+    """Limits of the rest of the start."""
+
+
+def open_proven(
+    artifacts: Artifacts,
+    *,
+    schedule: Schedule | None = None,
+    activity: TickActivity | None = None,
+    guard: StartGuard | None = None,
+) -> Opened:
+    """Open every graph on the provider that ships and run the self-test; raises ArtifactError."""
+    guard = guard or StartGuard(artifacts)
+    with guard.stage("opening the graphs", OPEN_S):
+        policy = Policy(artifacts, schedule=schedule, activity=activity, interrupt=guard.interrupt)
+        language = LanguageModel(artifacts, schedule=schedule, interrupt=guard.interrupt)
+    known = artifacts.known_answers
+    with guard.stage("self-test", OPEN_S if known is None else known.limit_s):
+        return Opened(policy, language, check_answers(policy, language, known), guard)
 
 
 def warm_up(policy: Policy, language: LanguageModel, image_px: int, frame_count: int) -> float:

@@ -26,6 +26,7 @@ from edge.core.cli import (
     OutputError,
     check_result_target,
     command_line,
+    printable,
     write_result,
 )
 from edge.flightlog.reader import parts
@@ -169,7 +170,7 @@ def main(argv: list[str] | None = None) -> int:
     lines = operator_lines("edge-run")
     try:
         sessions: list[RunSession] = []
-        code = _run(args, lines.write, sessions)
+        code = _run(args, lambda line: lines.write(printable(line)), sessions)
     finally:
         lines.close(LINES_S)
     if any(session.hung for session in sessions):

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from edge.core.geometry import SE2
 from edge.core.stats import Samples
-from edge.flightlog.recorder import Recorder
+from edge.flightlog.recorder import RecordSink
 from edge.inference.graph import GraphError
 from edge.inference.policy import Policy
 from edge.motion.controller import TARGET_TIME_S, Controller, ControllerInputs, VelocityCommand, is_plan
@@ -122,7 +122,7 @@ class ControlOutputs:
     """Sinks of the commands, log records and ticks."""
 
     sink: CommandSink
-    recorder: Recorder | None = None
+    recorder: RecordSink | None = None
     on_tick: Callable[[bool], None] = lambda _on_time: None
     """Called after every tick with whether it was on time; it must neither wait nor raise."""
 

@@ -17,10 +17,10 @@ from edge.artifacts.manifest import Artifacts
 from edge.core.deadline import Deadline
 from edge.flightlog.recorder import Recorder, space_refusal
 from edge.inference.graph import GraphError
-from edge.inference.language import ContextOverflowError, LanguageModel
-from edge.inference.policy import Policy
+from edge.inference.language import ContextOverflowError
 from edge.inference.scheduling import TickActivity, enter, freeze_garbage, lock_memory, schedule_for
-from edge.inference.warm_up import check_tick, warm_up
+from edge.inference.start_guard import WARM_UP_S
+from edge.inference.warm_up import check_tick, open_proven, warm_up
 from edge.reasoning.generation_cycle import Mode
 from edge.reasoning.prompt import InstructionError
 from edge.run.arming import POLL_S, RefusedError, StoppedEarlyError, arm, disarm
@@ -87,11 +87,13 @@ class RunSession:
             )
         options.switches_for(artifacts)
         activity = TickActivity(self._period_ns)
-        policy = Policy(artifacts, schedule=self._schedule, activity=activity)
-        language = LanguageModel(artifacts, schedule=self._schedule)
+        opened = open_proven(artifacts, schedule=self._schedule, activity=activity)
+        policy, language = opened.policy, opened.language
+        self._lines.append(f"self-test: {opened.tested}")
         language.check_instruction(options.instruction)
         try:
-            tick_ms = warm_up(policy, language, runtime.image_px, len(runtime.frame_offsets_s))
+            with opened.guard.stage("warming up", WARM_UP_S):
+                tick_ms = warm_up(policy, language, runtime.image_px, len(runtime.frame_offsets_s))
         except (GraphError, ContextOverflowError) as error:
             raise ArtifactError(f"{artifacts.directory}: the graphs do not run ({error})") from error
         check_tick(artifacts, tick_ms)

@@ -109,7 +109,7 @@ def inside(directory: Path, name: str) -> Path:
     `snapshots/REVISION/` into its `blobs/` are followed.
     """
     path = directory / name
-    if Path(name).name != name or name in ("", ".", ".."):
+    if Path(name).name != name or name in ("", ".", "..") or not name.isprintable():
         raise CheckpointError(f"{directory}: {name!r} is not a file name of this directory")
     root, target = directory.resolve(), path.resolve()
     blobs = root.parent.parent / "blobs"

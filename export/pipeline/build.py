@@ -75,6 +75,7 @@ EXPECTED_S = {
     "reference": (0.5, 20.0),
     "graph": (0.5, 15.0),
     "gate": (2.0, 45.0),
+    "self-test": (0.5, 20.0),
     "plan and report": (0.2, 1.0),
 }
 """Expected duration of each kind of stage before the first measurement, s: for a small and for a large model."""
@@ -117,7 +118,7 @@ def build_stages(job: Job, known_s: Mapping[str, float], *, graphs: bool = True)
             names += ["activation ranges"]
         names += [f"graph {graph}" for graph in order]
     names += [f"gate {graph}" for graph in order]
-    names += ["plan and report"] if graphs else []
+    names += ["self-test", "plan and report"] if graphs else ["self-test"]
     usual = {name: next(EXPECTED_S[kind][column] for kind in EXPECTED_S if name.startswith(kind)) for name in names}
     return [Stage(name, known_s.get(name, usual[name])) for name in names]
 

@@ -142,6 +142,10 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--out", type=Path, metavar="DIR", help="directory for results, logs, videos and report.html")
     p.add_argument("--resume", action="store_true", help="continue the interrupted run in --out")
     p.add_argument("--video", choices=VIDEO_CHOICES, default="none", help="episodes to record on video (default none)")
+    p.add_argument(
+        "--flight-logs", choices=VIDEO_CHOICES, help="episodes of an artifact policy whose flight log is kept and "
+        "explained in the report: all, failed (or collided), none (default: failed with --out; lockstep only)",
+    )  # fmt: skip
     p.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     return p
 
@@ -220,7 +224,8 @@ def _run(args: argparse.Namespace) -> int:
         done = len(read_results(folder)) if args.resume else 0
         with BenchProgress(len(run.episodes), done) as progress:
             execution = execute(
-                run, folder, _backend(args), resume=args.resume, video=args.video, stopped=lambda: bool(stop),
+                run, folder, _backend(args), resume=args.resume, video=args.video,
+                flights=args.flight_logs or ("none" if args.out is None else "failed"), stopped=lambda: bool(stop),
                 watcher=progress.watcher,
             )  # fmt: skip
         store, finished, result = execution.store, execution.finished, execution.result

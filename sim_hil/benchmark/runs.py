@@ -86,10 +86,11 @@ class BenchRun:
             "versions": versions(),
         }
 
-    def tasks(self, folder: Path, video: str = "none") -> list[EpisodeTask]:
+    def tasks(self, folder: Path, video: str = "none", flights: str = "none") -> list[EpisodeTask]:
         """Return one task per episode, the longest first, for an even load. Raises ConditionsError."""
         tasks = [
-            EpisodeTask(episode, self.conditions, folder, video, self.manifest_sha256) for episode in self.episodes
+            EpisodeTask(episode, self.conditions, folder, video, flights, self.manifest_sha256)
+            for episode in self.episodes
         ]
         # Simulation time grows with the time limit and the crowd.
         return sorted(tasks, key=lambda task: -task.episode.timeout_s * (20 + task.episode.people))
@@ -187,6 +188,7 @@ def execute(
     *,
     resume: bool,
     video: str = "none",
+    flights: str = "none",
     stopped: Callable[[], bool],
     watcher: RunWatcher | None = None,
 ) -> Execution:
@@ -196,7 +198,7 @@ def execute(
     try:
         store = (ResultStore.resume if resume else ResultStore.create)(directory, run.config())
         before = len(store.results)
-        tasks = run.tasks(store.directory, video)
+        tasks = run.tasks(store.directory, video, flights)
         finished = run_all(tasks, backend, store, stopped=stopped, watcher=watcher)
     finally:
         backend.close()

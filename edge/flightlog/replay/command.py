@@ -38,6 +38,10 @@ EXAMPLES = """examples:
   edge-replay flight.mcap --artifacts out/nano --from 30 --to 45 --json -
   edge-replay flight.mcap --artifacts out/new --force     # how far another policy would have driven apart
 
+sub-commands, each with --help:
+  edge-replay explain flight.mcap                 # why the robot stopped, collided, went astray or ran out of time
+  edge-replay video flight.mcap --out flight.mp4  # picture with plan and waypoints drawn in it
+
 On the machine and with the artifacts of the run, plans and texts are equal bit for bit. A log of a run that was killed
 is replayed as far as it is whole; further parts (flight.002.mcap ...) are read with the first.
 exit codes: 0 within the tolerance, 1 beyond it or less than 90 % of the plans could be made again, 2 bad arguments or

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -50,8 +51,12 @@ class Rig:
         self.session: RunSession
         self.stop_flag: threading.Event
         fakes: dict[str, Any] = {
-            "Policy": lambda *_args, **_named: None,
-            "LanguageModel": lambda *_args, **_named: SimpleNamespace(check_instruction=lambda *_: None),
+            "open_proven": lambda *_args, **_named: SimpleNamespace(
+                policy=None,
+                language=SimpleNamespace(check_instruction=lambda *_: None),
+                tested="",
+                guard=SimpleNamespace(stage=lambda *_: nullcontext()),
+            ),
             "schedule_for": lambda _artifacts: SimpleNamespace(notes=(), control=None),
             "warm_up": lambda *_: 1.0,
             "check_tick": lambda *_: None,
