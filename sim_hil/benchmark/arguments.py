@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from edge.core.cli import check_result_directory, check_result_target
-from edge.state.switches import Decoding, RecoverySwitch
+from edge.state.switches import Decoding, RecoverySwitch, Speculation
 from firmware_bridge.system.terminal import CommandParser
 from sim_hil.benchmark.conditions.conditions import (
     BASELINES,
@@ -103,6 +103,10 @@ def parser() -> argparse.ArgumentParser:
         help="recoveries of an artifact policy; off: only the plan moves the robot (default: the manifest's)",
     )  # fmt: skip
     p.add_argument(
+        "--speculation", choices=[each.value for each in Speculation],
+        help="whether a call verifies guessed tokens; the results are equal bit for bit (default: the manifest's)",
+    )  # fmt: skip
+    p.add_argument(
         "--stay", action=argparse.BooleanOptionalAction, default=False,
         help="halt at the stop that the reasoning text gives, as edge-run does (default: only the goal ends the run)",
     )  # fmt: skip
@@ -164,6 +168,7 @@ def conditions_of(args: argparse.Namespace) -> Conditions:
         swap_instructions=args.swap_instructions,
         decoding=args.decoding,
         recovery=args.recovery,
+        speculation=args.speculation,
         stays=args.stay,
         camera=args.camera,
         external_timeout_s=args.external_timeout,
