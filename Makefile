@@ -23,14 +23,16 @@ tiers = @folder=$$(mktemp -d) && trap 'rm -rf "$$folder"' EXIT && export EDGE_TE
 # Tests start hundreds of processes; without compiled modules on the disk each would compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo demos nano faults test test-slow test-random test-all stops lint clean
+.PHONY: help demo demos nano faults contract test test-slow test-random test-all stops lint clean
 
 help:
 	@echo "make demo   export, simulate, drive for $(DURATION) s and write out/demo/report.html"
+	@echo "            LIVE=1: with a live view in the browser, whose address is printed"
 	@echo "            ROBOT=carter-can, carter-mavlink or carter-ros2: another robot and protocol than the go2's"
 	@echo "make demos  the demo with ten seeds (about 15 min); out/demos/SEED/report.html"
 	@echo "make nano   train the shipped model from nothing into out/nano-run (hours; Ctrl-C and again goes on)"
 	@echo "make faults inject every fault into real processes, some 230 times (about 15 min), and write out/faults/"
+	@echo "make contract  faults of link, bridge and runner on every robot, 20 times each, into out/contract/ (an hour; resumes)"
 	@echo "make test   lint, type-check and run the fast tests (less than 5 min on 2 cores)"
 	@echo "make test-all     lint, type-check and run every test (about 15 min on 2 cores)"
 	@echo "make test-slow    the tests that 'make test' leaves out"
@@ -45,7 +47,7 @@ help:
 # Stamps are newer than what they were installed from: a second run installs nothing.
 .venv/.demo-installed: pyproject.toml constraints.txt | .venv/bin/python
 	@echo "make: installing the demo's packages into .venv, once; log: .venv/install.log" >&2
-	@$(call install,export$(comma)sim)
+	@$(call install,export$(comma)sim$(comma)live)
 	@touch $@
 
 .venv/.test-installed: .venv/.demo-installed
@@ -54,7 +56,7 @@ help:
 	@touch $@
 
 demo: .venv/.demo-installed
-	@$(BIN)/python -m tools.demo --robot $(ROBOT) --out out/demo --duration $(DURATION) --seed $(SEED) --people $(PEOPLE)
+	@$(BIN)/python -m tools.demo --robot $(ROBOT) --out out/demo --duration $(DURATION) --seed $(SEED) --people $(PEOPLE) $(if $(LIVE),--live)
 
 # Ten worlds with one model, each with a report of its own; says how many passed every check.
 demos: .venv/.demo-installed
@@ -71,8 +73,18 @@ nano: .venv/.demo-installed
 
 # The demo's artifacts, if they are there; otherwise its own.
 faults: .venv/.demo-installed
-	@test -f out/demo/artifacts/manifest.json || $(BIN)/edge-export --target cpu --model nano --random-weights 0 --out out/demo/artifacts
+	@grep -qs '"schema_version": 4' out/demo/artifacts/manifest.json || $(BIN)/edge-export --target cpu --model nano --random-weights 0 --out out/demo/artifacts
 	@$(BIN)/python -m tools.faults --robot $(ROBOT) --artifacts out/demo/artifacts --out out/faults
+
+# One robot: make contract ROBOTS=carter-can. A second call keeps the rows that are there; OUT=DIR writes elsewhere.
+ROBOTS = go2 carter-can carter-mavlink carter-ros2
+OUT = out/contract
+contract: .venv/.demo-installed
+	@grep -qs '"schema_version": 4' out/demo/artifacts/manifest.json || $(BIN)/edge-export --target cpu --model nano --random-weights 0 --out out/demo/artifacts
+	@failed=0; for robot in $(ROBOTS); do \
+		$(BIN)/python -m tools.faults --robot $$robot --contract --resume --per-row 20 --artifacts out/demo/artifacts --out $(OUT)/$$robot; \
+		code=$$?; case $$code in 0) ;; 1) failed=1;; *) exit $$code;; esac; \
+	done; $(BIN)/python -m tools.faults --table $(ROBOTS:%=$(OUT)/%) > $(OUT)/table.md && cat $(OUT)/table.md && exit $$failed
 
 lint: .venv/.test-installed
 	$(BIN)/ruff check .

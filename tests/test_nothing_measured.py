@@ -36,12 +36,12 @@ def test_a_replay_of_no_tick_is_not_equal() -> None:
 
 
 def test_faults_without_a_row_do_not_pass() -> None:
-    assert result([], {})["pass"] is False
+    assert result([], {}, "go2")["pass"] is False
 
 
 def test_a_row_without_an_injection_does_not_pass() -> None:
     assert RowResult(rows()[0], []).problems == ["no injection"]
-    assert result([RowResult(rows()[0], [])], {})["pass"] is False
+    assert result([RowResult(rows()[0], [])], {}, "go2")["pass"] is False
 
 
 def test_a_suite_without_episodes_is_not_valid(monkeypatch: pytest.MonkeyPatch) -> None:

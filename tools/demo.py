@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import shutil
 import signal
 import sys
@@ -17,12 +18,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from edge.artifacts.files import MANIFEST_NAME
+from edge.artifacts.files import MANIFEST_NAME, read_manifest
 from edge.core.cli import (
     EXIT_BAD_INPUT,
     EXIT_CHECK_FAILED,
     EXIT_DONE,
     EXIT_INTERRUPTED,
+    check_result_target,
     command_line,
     messages,
     write_result,
@@ -31,6 +33,8 @@ from export.checkpoint.load import shipped_weights
 from export.model.config import PRESETS
 from export.model.weights import CheckpointError
 from firmware_bridge.core.config import ConfigError, load_robot_config
+from firmware_bridge.system.input_file import read_json
+from firmware_bridge.system.terminal import CommandParser
 from reporting.progress import Progress
 from sim_hil.realtime.children import Child, Children, StepError
 from sim_hil.realtime.robots import BRIDGE_SOCKET, GO2, ROBOTS, RunAddress, StackRobot, StackRobotError, free_domain
@@ -77,6 +81,8 @@ class DemoOptions:
     people: int
     domain: int
     robot: StackRobot = GO2
+    live: bool = False
+    """Whether the runner serves a live view."""
 
     def __post_init__(self) -> None:
         if not 5.0 <= self.duration_s <= 86_400.0:
@@ -101,7 +107,7 @@ class DemoOptions:
 
     def _artifacts_from_out(self) -> str:
         """Return the artifacts' path, relative if inside `out`, so that the folder can be moved, else absolute."""
-        out, artifacts = self.out.resolve(), self.artifacts.resolve()
+        out, artifacts = Path(os.path.realpath(self.out)), Path(os.path.realpath(self.artifacts))
         return str(artifacts.relative_to(out) if artifacts.is_relative_to(out) else artifacts)
 
     @property
@@ -192,7 +198,7 @@ def _export(options: DemoOptions, command: Sequence[str], children: Children) ->
 def trained(artifacts: Path) -> bool:
     """Return whether the manifest records trained weights; False if it cannot be read."""
     try:
-        return json.loads((artifacts / MANIFEST_NAME).read_text(encoding="utf-8"))["model"]["trained"] is True
+        return read_json(artifacts / MANIFEST_NAME)["model"]["trained"] is True
     except (OSError, ValueError, KeyError, TypeError):
         return False
 
@@ -225,6 +231,9 @@ def _drive(
     with _progress(lambda elapsed_s: f"starting the bridge, {elapsed_s:.0f} s") as progress:
         children.wait_until(bridge, socket.exists, BRIDGE_TIMEOUT_S, f"socket {socket}", progress.tick)
     run = children.start("edge-run", [*commands["edge-run"], *common, *_run_arguments(options)])
+    if options.live:
+        children.wait_until(run, lambda: _live_line(run.log) is not None, STARTUP_TIMEOUT_S, "live view", lambda: None)
+        _print(_live_line(run.log) or "")
     trace = TraceTail(files.trace)
 
     def describe(elapsed_s: float) -> str:
@@ -272,7 +281,14 @@ def _run_arguments(options: DemoOptions) -> list[str]:
         *("--artifacts", str(options.artifacts), "--instruction", INSTRUCTION, "--mode", "async"),
         *("--duration", str(options.duration_s), "--release-delay", str(RELEASE_DELAY_S)),
         *("--record", str(files.flight_log), "--json", str(files.result("edge-run"))),
+        *(("--live", "0") if options.live else ()),
     ]
+
+
+def _live_line(log: Path) -> str | None:
+    """Return the runner's line with the live view's address."""
+    lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
+    return next((line.partition("edge-run: ")[2] for line in lines if "live view: http" in line), None)
 
 
 def _says_ready(log: Path) -> bool:
@@ -281,7 +297,7 @@ def _says_ready(log: Path) -> bool:
 
 def parser() -> argparse.ArgumentParser:
     """Return the argument parser."""
-    p = argparse.ArgumentParser(
+    p = CommandParser(
         "python -m tools.demo",
         description=__doc__,
         epilog=EXAMPLES,
@@ -294,6 +310,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--people", type=int, default=4, help="walking people (default: 4)")
     p.add_argument("--robot", choices=tuple(ROBOTS), default=GO2.name, help=f"robot to drive (default: {GO2.name})")
     p.add_argument("--domain", type=int, help="DDS domain of a robot with DDS (default: a free one)")
+    p.add_argument("--live", action="store_true", help="serve a live view while it drives, and print its address")
     p.add_argument("--json", metavar="FILE|-", help="also write demo.json's content to this file; - is stdout")
     return p
 
@@ -305,7 +322,12 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]
     try:
         domain = free_domain() if args.domain is None else args.domain
         artifacts = args.artifacts or args.out / "artifacts"
-        options = DemoOptions(args.out, artifacts, args.duration, args.seed, args.people, domain, ROBOTS[args.robot])
+        check_result_target(args.json)
+        if artifacts.exists():
+            read_manifest(artifacts)
+        options = DemoOptions(
+            args.out, artifacts, args.duration, args.seed, args.people, domain, ROBOTS[args.robot], args.live
+        )
         _make_folder(options.log_dir)
     except (ValueError, OSError) as error:
         _print(str(error))

@@ -24,14 +24,20 @@ HASH_BLOCK_BYTES = 1 << 20
 SEAL = "manifest_sha256"
 """Key of the manifest's own hash: a wrong bit in a rate or an id is as dangerous as one in a weight."""
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*", re.ASCII)
-_SUFFIXES = (".onnx", ".onnx.data", ".json", ".html")
-"""All file kinds of an export. An artifact directory contains nothing that could be run or unpickled."""
 _REFUSED_CONTENT = (
     (re.compile(rb"\x80[\x02-\x05]"), "a pickle"),
     (re.compile(rb"PK\x03\x04"), "a zip archive (.pt, .npz)"),
     (re.compile(rb"\x93NUMPY"), "a NumPy array"),
 )
-SECTIONS = ("schema_version", "target", "model", "runtime", "graphs", "files", "plan", "provenance", SEAL)
+SECTIONS = (
+    "schema_version", "target", "model", "runtime", "graphs", "files", "plan", "self_test", "provenance", SEAL
+)  # fmt: skip
+MAX_NESTING = 32
+"""Deepest nesting of a manifest; an export writes 9 levels."""
+MAX_BYTES = {".onnx.data": 64 << 30, ".onnx": 512 << 20, ".json": 64 << 20, ".html": 64 << 20}
+"""Largest file of each kind, bytes: checked before it is read. An export moves weights above 64 MB to a data file."""
+MAX_IN_MEMORY_BYTES = 2 << 30
+"""All files together that are read into memory."""
 
 
 class ArtifactError(ValueError):
@@ -96,15 +102,20 @@ def parse_manifest(directory: Path, raw: bytes) -> dict[str, Any]:
     """Parse a manifest's bytes; check its hash, version and sections; raises ArtifactError."""
     path = directory / MANIFEST_NAME
     try:
-        manifest: Any = json.loads(raw)
+        manifest: Any = json.loads(raw, parse_constant=_refuse_constant)
+        if _nesting(manifest) > MAX_NESTING:
+            raise ArtifactError(f"{path}: nested deeper than {MAX_NESTING} levels, refused")
+    except ArtifactError:
+        raise
     except (ValueError, RecursionError) as error:
         raise ArtifactError(f"{path}: not JSON ({error})") from error
     if not isinstance(manifest, dict):
         raise ArtifactError(f"{path}: expected a JSON object")
-    if manifest.get("schema_version") != SCHEMA_VERSION:
-        raise ArtifactError(
-            f"{path}: schema version {manifest.get('schema_version')!r}, expected {SCHEMA_VERSION}; export again"
-        )
+    version = manifest.get("schema_version")
+    if version != SCHEMA_VERSION:
+        older = type(version) is int and 0 < version < SCHEMA_VERSION
+        advice = _older(directory, manifest) if older else "export again"
+        raise ArtifactError(f"{path}: schema version {version!r}, expected {SCHEMA_VERSION}; {advice}")
     missing = [section for section in SECTIONS if section not in manifest]
     if missing:
         raise ArtifactError(f"{path}: sections {missing} are missing")
@@ -113,19 +124,53 @@ def parse_manifest(directory: Path, raw: bytes) -> dict[str, Any]:
     return manifest
 
 
+def _refuse_constant(text: str) -> float:
+    raise ValueError(f"{text} is no number")
+
+
+def _nesting(content: Any) -> int:
+    """Return the depth of a JSON value, without recursion."""
+    depth, level = 0, [content] if isinstance(content, dict | list) else []
+    while level and depth <= MAX_NESTING:
+        depth += 1
+        parts = [value.values() if isinstance(value, dict) else value for value in level]
+        level = [value for part in parts for value in part if isinstance(value, dict | list)]
+    return depth
+
+
+def _older(directory: Path, manifest: Mapping[str, Any]) -> str:
+    """Return the advice for a manifest of an older release: the command that exports again."""
+    asked = manifest.get("provenance")
+    asked = asked.get("asked") if isinstance(asked, dict) else None
+    named = [(key, asked.get(key) if isinstance(asked, dict) else None) for key in ("target", "model")]
+    options = [f"--{key} {name} " for key, name in named if isinstance(name, str) and _PLAIN_NAME.fullmatch(name)]
+    return (
+        f"an older release wrote it, without a self-test; export again: edge-export {''.join(options)}--out {directory}"
+    )
+
+
 def check_entry(name: str, entry: Any) -> None:
     """Check that a listed file has a plain name of a permitted kind, a size and a hash; raises ArtifactError."""
     if not _PLAIN_NAME.fullmatch(name) or name in (MANIFEST_NAME, SIGNATURE_NAME):
         raise ArtifactError(f"{MANIFEST_NAME}: file name {name!r} is not a plain name")
-    if not name.endswith(_SUFFIXES):
-        kinds = ", ".join(_SUFFIXES)
+    # All kinds of an export: an artifact directory contains nothing that could be run or unpickled.
+    if not name.endswith(tuple(MAX_BYTES)):
+        kinds = ", ".join(MAX_BYTES)
         raise ArtifactError(f"{MANIFEST_NAME}: file {name!r} is of no kind that artifacts have ({kinds})")
-    if (
-        not isinstance(entry, dict)
-        or not isinstance(entry.get("bytes"), int)
-        or not isinstance(entry.get("sha256"), str)
-    ):
+    if not isinstance(entry, dict) or type(entry.get("bytes")) is not int or not isinstance(entry.get("sha256"), str):
         raise ArtifactError(f"{MANIFEST_NAME}: entry of {name} must give bytes and sha256")
+    most = next(most for suffix, most in MAX_BYTES.items() if name.endswith(suffix))
+    if not 0 <= entry["bytes"] <= most:
+        raise ArtifactError(f"{MANIFEST_NAME}: {name} has {entry['bytes']} bytes, expected at most {most}")
+
+
+def check_files(files: Mapping[str, Any]) -> None:
+    """Check every listed file and the size of all that are read into memory; raises ArtifactError."""
+    for name, entry in files.items():
+        check_entry(name, entry)
+    total = sum(entry["bytes"] for name, entry in files.items() if not name.endswith(".data"))
+    if total > MAX_IN_MEMORY_BYTES:
+        raise ArtifactError(f"{MANIFEST_NAME}: files of {total} bytes together, expected at most {MAX_IN_MEMORY_BYTES}")
 
 
 def read_file(directory: Path, name: str, entry: Any) -> bytes:

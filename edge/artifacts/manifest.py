@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,26 +15,30 @@ from edge.artifacts.files import (
     SIGNATURE_NAME,
     ArtifactError,
     FileIdentity,
-    check_entry,
+    check_files,
     hash_file,
     parse_manifest,
     read_file,
     read_manifest_bytes,
 )
+from edge.artifacts.known_answers import KnownAnswers, read_known_answers
 from edge.artifacts.providers import wrong_option
+from edge.artifacts.runtime import SPECIAL_TOKENS, RuntimeConfig, check_agreement, nested, read_runtime
+from edge.artifacts.tokenizer_file import TokenizerFileError, check_tokenizer_file
 from edge.artifacts.trust import Trust
 from edge.state.reasoning_text import WAYPOINT_TIMES_S
-from edge.state.switches import Decoding, RecoverySwitch
-from firmware_bridge.core.config import BRIDGE_PRIORITY
 
 LANGUAGE_WHOLE = ("language_model",)
 LANGUAGE_PAIR = ("language_model.prefill", "language_model.decode")
-_POSITIVE = frozenset((
-    "image_px", "frame_tokens", "kv_dim", "max_context", "max_new_tokens", "prefill_chunk_tokens", "tick_period_ms",
-    "step_s",
-))  # fmt: skip
-_SWITCHES: Mapping[str, type[Decoding | RecoverySwitch]] = {"decoding": Decoding, "recovery": RecoverySwitch}
-_LISTS = ("frame_offsets_s", "control_cores", "reasoning_cores")
+MOST_ROWS = 16
+"""Most positions of one call whose next token a language graph chooses."""
+MAX_ELEMENTS = 1 << 31
+"""Elements of a tensor's fixed axes; a larger one would be allocated before the graph is proven."""
+MAX_CACHE_BYTES = 16 << 30
+"""KV buffers of the longest context, bytes."""
+_ITEM_BYTES = {"float": 4, "float16": 2}
+HORIZON_S = (1.0, 10.0)
+"""The controller aims at 1 s; no policy plans further than 10 s."""
 
 
 @dataclass(frozen=True)
@@ -89,47 +94,6 @@ class GraphContract:
 
 
 @dataclass(frozen=True)
-class RuntimeConfig:
-    """The runner's settings from the manifest."""
-
-    image_px: int
-    frame_tokens: int
-    kv_dim: int
-    max_context: int
-    max_new_tokens: int
-    prefill_chunk_tokens: int
-    frame_offsets_s: tuple[float, ...]
-    tick_period_ms: int
-    step_s: float
-    im_start_id: int
-    im_end_id: int
-    img_start_id: int
-    img_end_id: int
-    img_context_id: int
-    control_cores: tuple[int, ...]
-    """Processor cores of the control thread; empty: the runner chooses among the available ones."""
-    reasoning_cores: tuple[int, ...]
-    control_priority: int
-    """Real-time priority of the control thread, above 0 and below the bridge's; 0: none."""
-    decoding: Decoding = Decoding.CONSTRAINED
-    recovery: RecoverySwitch = RecoverySwitch.ON
-    """Default switches, which a command's options override; older manifests lack them."""
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if name in _POSITIVE and value <= 0:
-                raise ArtifactError(f"{MANIFEST_NAME}: runtime.{name} must be positive, found {value}")
-        if not self.frame_offsets_s or len(self.frame_offsets_s) > 16 or max(self.frame_offsets_s) > 60:
-            raise ArtifactError(f"{MANIFEST_NAME}: runtime.frame_offsets_s must be 1 to 16 offsets of at most 60 s")
-        if self.control_priority >= BRIDGE_PRIORITY:
-            raise ArtifactError(
-                f"{MANIFEST_NAME}: runtime.control_priority {self.control_priority}, expected 0 to "
-                f"{BRIDGE_PRIORITY - 1}, below the bridge's {BRIDGE_PRIORITY}: export again with "
-                f"--set runtime.control_priority=50"
-            )
-
-
-@dataclass(frozen=True)
 class Artifacts:
     """A verified directory: the bytes that were hashed are the bytes that will be run."""
 
@@ -144,6 +108,8 @@ class Artifacts:
     """Every file but the graphs' data files."""
     identities: Mapping[str, FileIdentity]
     """Identities of the data files at their hashing."""
+    known_answers: KnownAnswers | None = None
+    """Answers of the self-test; None in an export under way."""
     release: int | None = None
     """Release counter of the required signature; None: no signature was required."""
 
@@ -156,6 +122,12 @@ class Artifacts:
     def guided_by_waypoints(self) -> bool:
         """Whether the action expert receives the text's waypoints instead of last-layer K‖V."""
         return any(tensor.name == "waypoints" for tensor in self.graphs["semantic_context"].inputs)
+
+    @property
+    def cache_bytes(self) -> int:
+        """Size of the KV buffers for the longest context, bytes."""
+        caches = self.graphs[self.language_graphs[-1]].caches
+        return sum(_bytes(cache, self.runtime.max_context) for cache in caches)
 
     def check_unchanged(self, names: Iterable[str]) -> None:
         """Raise ArtifactError if a data file has changed since its hashing."""
@@ -178,8 +150,7 @@ def load_artifacts(directory: Path, trust: Trust | None = None) -> Artifacts:
     release = None if trust is None else trust.check(directory, raw)
     manifest = parse_manifest(directory, raw)
     files = _section(manifest, "files")
-    for name, entry in files.items():
-        check_entry(name, entry)
+    check_files(files)
     data = {name for graph in _section(manifest, "graphs").values() for name in _data_files(graph)}
     contents = {name: read_file(directory, name, entry) for name, entry in files.items() if name not in data}
     identities = {name: hash_file(directory, name, entry) for name, entry in files.items() if name in data}
@@ -200,27 +171,44 @@ def load_artifacts(directory: Path, trust: Trust | None = None) -> Artifacts:
     surplus = sorted(set(_section(manifest, "graphs")) - set(graphs))
     if surplus:
         raise ArtifactError(f"{MANIFEST_NAME}: graph {surplus[0]!r} is unknown to the runner")
-    if "tokenizer.json" not in contents:
-        raise ArtifactError(f"{directory}: tokenizer.json is missing from the manifest")
+    runtime = read_runtime(_section(manifest, "runtime"))
     model = _section(manifest, "model")
+    _check_tokenizer(contents, runtime, nested(model, "config", "language", "vocab"))
     artifacts = Artifacts(
         directory=directory,
         manifest_sha256=str(manifest[SEAL]),
         target=str(manifest["target"]),
         model_name=str(model.get("name")),
         trained=model.get("trained") is True,
-        runtime=_runtime(_section(manifest, "runtime")),
+        runtime=runtime,
         graphs=graphs,
         contents=contents,
         identities=identities,
+        known_answers=read_known_answers(manifest["self_test"], graphs),
         release=release,
     )
-    check_contract(artifacts)
+    check_agreement(manifest, runtime, check_contract(artifacts))
     for graph in graphs.values():
         _check_external_data(graph, contents[graph.file], identities)
     if trust is not None and release is not None:
         trust.accept(release)
     return artifacts
+
+
+def _check_tokenizer(contents: Mapping[str, bytes], runtime: RuntimeConfig, vocabulary: Any) -> None:
+    """Check the tokenizer, its special tokens' ids and the size of its vocabulary; raises ArtifactError.
+
+    `vocabulary`: number of tokens of the network; None if the manifest does not record it.
+    """
+    if "tokenizer.json" not in contents:
+        raise ArtifactError(f"{MANIFEST_NAME}: tokenizer.json is missing from the files")
+    special = {token: int(getattr(runtime, name)) for name, token in SPECIAL_TOKENS.items()}
+    try:
+        size = check_tokenizer_file(contents["tokenizer.json"], special)
+        if isinstance(vocabulary, int) and size > vocabulary:
+            raise TokenizerFileError(f"has the token id {size - 1}, the network's vocabulary ends at {vocabulary - 1}")
+    except TokenizerFileError as error:
+        raise ArtifactError(f"tokenizer.json: {error}; export again") from error
 
 
 def _check_external_data(graph: GraphContract, content: bytes, identities: Mapping[str, FileIdentity]) -> None:
@@ -259,6 +247,11 @@ def _tensors(graph: str, entry: Mapping[str, Any], key: str) -> tuple[TensorCont
     for item in declared:
         if not isinstance(item, dict) or set(item) != {"name", "dtype", "shape"} or not isinstance(item["shape"], list):
             raise ArtifactError(f"{MANIFEST_NAME}: graph {graph}: {key} must be name, dtype and shape")
+        axes = [axis for axis in item["shape"] if not isinstance(axis, str)]
+        if not all(type(axis) is int and axis > 0 for axis in axes) or math.prod(axes) > MAX_ELEMENTS:
+            raise ArtifactError(
+                f"{MANIFEST_NAME}: graph {graph}: {key} has a tensor of shape {str(item['shape'])[:80]}"
+            )
         tensors.append(TensorContract(str(item["name"]), str(item["dtype"]), tuple(item["shape"])))
     return tuple(tensors)
 
@@ -294,33 +287,8 @@ def _session(graph: str, entry: Any) -> SessionConfig:
     return SessionConfig(entry["provider"], options, threads, entry["engine"])
 
 
-def _runtime(section: dict[str, Any]) -> RuntimeConfig:
-    fields = RuntimeConfig.__dataclass_fields__
-    if not set(fields) - set(_SWITCHES) <= set(section) <= set(fields):
-        raise ArtifactError(f"{MANIFEST_NAME}: runtime has {sorted(section)}, expected {sorted(fields)}")
-    lists = {key: section[key] for key in _LISTS}
-    numbers = {key: value for key, value in section.items() if key not in (*lists, *_SWITCHES)}
-    if not all(isinstance(values, list) and len(values) <= 1024 for values in lists.values()) or not all(
-        isinstance(v, int | float) and not isinstance(v, bool) and 0 <= v < 1e6
-        for v in [*numbers.values(), *(v for values in lists.values() for v in values)]
-    ):
-        raise ArtifactError(f"{MANIFEST_NAME}: runtime values must be numbers that are not negative")
-    values: dict[str, Any] = {key: value if key == "step_s" else int(value) for key, value in numbers.items()}
-    values |= {key: tuple((float if key == "frame_offsets_s" else int)(v) for v in lists[key]) for key in _LISTS}
-    return RuntimeConfig(**values, **_switches(section))
-
-
-def _switches(section: Mapping[str, Any]) -> dict[str, Any]:
-    """Read the switches of a runtime section; raises ArtifactError."""
-    try:
-        return {key: kind(section[key]) for key, kind in _SWITCHES.items() if key in section}
-    except ValueError as error:
-        known = {key: [each.value for each in kind] for key, kind in _SWITCHES.items()}
-        raise ArtifactError(f"{MANIFEST_NAME}: runtime: {error}; expected {known}") from error
-
-
-def check_contract(artifacts: Artifacts) -> None:
-    """Check that the graphs fit one another and the runner: names, types and widths; raises ArtifactError."""
+def check_contract(artifacts: Artifacts) -> int:
+    """Check that the graphs fit one another and the runner; return the steps of a trajectory. Raises ArtifactError."""
     vision, context, action = (artifacts.graphs[n] for n in ("vision_encoder", "semantic_context", "action_expert"))
     first, last = (artifacts.graphs[name] for name in (artifacts.language_graphs[0], artifacts.language_graphs[-1]))
     runtime = artifacts.runtime
@@ -330,7 +298,7 @@ def check_contract(artifacts: Artifacts) -> None:
         (vision, tokens, "float", (1, *tokens.shape[1:])),
         (first, first.input("visual_tokens"), "float", ("F", *tokens.shape[1:])),
         (first, first.input("image_offset"), "int64", (1,)),
-        (last, last.output("next_token"), "int64", (1, 1)),
+        (last, last.output("next_token"), "int64", (1, "L")),
         (context, *_guidance(artifacts)),
         (action, action.input("visual_tokens"), "float", tokens.shape),
         (action, action.input("state"), "float", (1, 3)),
@@ -356,14 +324,27 @@ def check_contract(artifacts: Artifacts) -> None:
             )
     if not last.caches or len(first.caches) != len(last.caches):
         raise ArtifactError(f"{last.file}: {len(last.caches)} KV buffers, {first.file} has {len(first.caches)}")
+    if artifacts.cache_bytes > MAX_CACHE_BYTES:
+        raise ArtifactError(
+            f"{last.file}: KV buffers of {artifacts.cache_bytes} bytes, expected at most {MAX_CACHE_BYTES}"
+        )
     trajectory = action.output("trajectory")
     if trajectory.dtype != "float" or len(trajectory.shape) != 3 or trajectory.shape[2] != 3:
         raise ArtifactError(f"{action.file}: trajectory is {list(trajectory.shape)}, the runner expects [1, steps, 3]")
     steps = trajectory.shape[1]
-    if not isinstance(steps, int) or steps * runtime.step_s < 1.0:
+    least_s, most_s = HORIZON_S
+    if not isinstance(steps, int) or not least_s <= steps * runtime.step_s <= most_s:
         raise ArtifactError(
-            f"{action.file}: trajectory of {steps} steps does not reach the 1 s that the controller aims at"
+            f"{action.file}: trajectory of {steps} steps of {runtime.step_s:g} s, expected {least_s:g} to {most_s:g} s "
+            f"in all: the controller aims 1 s ahead"
         )
+    return steps
+
+
+def _bytes(tensor: TensorContract, free: int) -> int:
+    """Size of a tensor whose free axes have a length."""
+    axes = (axis if isinstance(axis, int) else free for axis in tensor.shape)
+    return math.prod(axes) * _ITEM_BYTES.get(tensor.dtype, 8)
 
 
 def _guidance(artifacts: Artifacts) -> tuple[TensorContract, str, tuple[int | str, ...]]:

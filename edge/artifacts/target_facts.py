@@ -8,8 +8,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from edge.artifacts.files import MANIFEST_NAME, ArtifactError
+from edge.artifacts.runtime import MAX_CORES
 
 GIB = 1 << 30
+MAX_MEMORY_BYTES = 16384 * GIB
+MAX_PLANNED = 10_000_000
+"""Largest plausible duration of a plan, ms (2.8 h), and number of tokens."""
 
 
 @dataclass(frozen=True)
@@ -32,10 +36,10 @@ class TargetFacts:
     def __post_init__(self) -> None:
         if not self.name or not self.architectures or not self.power_mode:
             raise ArtifactError(f"{MANIFEST_NAME}: provenance.target names no device, architecture or power mode")
-        if self.cores < 1 or not 0 < self.available_bytes <= self.memory_bytes:
+        if not (1 <= self.cores <= MAX_CORES and 0 < self.available_bytes <= self.memory_bytes <= MAX_MEMORY_BYTES):
             raise ArtifactError(
                 f"{MANIFEST_NAME}: provenance.target has {self.cores} cores, {self.available_bytes} of "
-                f"{self.memory_bytes} bytes available: expected positive numbers that fit"
+                f"{self.memory_bytes} bytes available: expected positive numbers of a device that exists"
             )
 
 
@@ -56,8 +60,9 @@ class PlanFacts:
 
     def __post_init__(self) -> None:
         for name in ("period_ms", "tick_ms", "tick_alone_ms", "prompt_tokens", "memory_bytes"):
-            if getattr(self, name) <= 0:
-                raise ArtifactError(f"{MANIFEST_NAME}: plan.{name} must be positive, found {getattr(self, name)}")
+            value, most = getattr(self, name), MAX_MEMORY_BYTES if name == "memory_bytes" else MAX_PLANNED
+            if not 0 < value <= most:
+                raise ArtifactError(f"{MANIFEST_NAME}: plan.{name} must be positive and at most {most}, found {value}")
 
 
 def target_facts(manifest: Mapping[str, Any]) -> TargetFacts | None:

@@ -23,7 +23,7 @@ import time
 from collections import Counter, deque
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from edge.flightlog.part import LogPart, PartFile, Payload, encode
 from edge.flightlog.reader import part_path, parts
@@ -40,6 +40,14 @@ _RESUME = 1.25
 _RUN_TOPIC = "/run"
 
 _Item = tuple[str, int, Payload]
+
+
+class RecordSink(Protocol):
+    """Place for the records of the runner's loops: a Recorder, or a simulator's own."""
+
+    def put(self, topic: str, stamp_ns: int, payload: Payload) -> None:
+        """Take one record; must not wait or raise."""
+        ...
 
 
 @dataclass(frozen=True)

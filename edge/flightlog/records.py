@@ -4,22 +4,16 @@ due."""
 from __future__ import annotations
 
 import math
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from edge.core.geometry import SE2
 from edge.flightlog.part import Payload
+from edge.flightlog.recorder import RecordSink
 from edge.odometry.drift_rate import DriftRate
 from firmware_bridge.core.robot_state import BatteryState, RobotState
-
-
-class RecordSink(Protocol):
-    """Takes records without making the caller wait: a recorder, or a live view."""
-
-    def put(self, topic: str, stamp_ns: int, payload: Payload) -> None:
-        """Take one record; never blocks, never raises."""
 
 
 class RecordSinks:

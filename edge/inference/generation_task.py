@@ -115,6 +115,24 @@ class GenerationTask:
             T_odom_stop=self.job.memory.stop,
         )
 
+    def state_record(self, result: GenerationResult, state: SemanticState) -> dict[str, Any]:
+        """Return the `/semantic` record of a published result without the times of the thread that computed it."""
+        assert self.anchor is not None
+        frames = [*self.older, self.anchor]
+        return {
+            "generation": state.generation,
+            "anchor_ns": state.anchor_ns,
+            "anchor_pose": state.T_odom_anchor.as_tuple(),
+            "ready_ns": state.ready_ns,
+            "instruction": self.job.instruction,
+            "frames_ns": [frame.stamp_ns for frame in frames],
+            "frame_poses": [frame.T_odom_base.as_tuple() for frame in frames],
+            **self.record(result),
+            "max_new_tokens": self.max_new_tokens,
+            "prefill_ms": result.generation.prefill_ms,
+            "decode_ms": result.generation.decode_ms,
+        }
+
     def record(self, result: GenerationResult) -> dict[str, Any]:
         """Return the log record of prompt and result; call it after `publish`."""
         stop = self.job.memory.stop
@@ -127,6 +145,7 @@ class GenerationTask:
             "stop": None if stop is None else stop.as_tuple(),
             "prompt_tokens": result.generation.prompt_tokens,
             "new_tokens": result.generation.new_tokens,
+            "decode_calls": result.generation.decode_calls,
             "text": result.generation.text,
             "waypoints": result.waypoints,
         }

@@ -46,6 +46,7 @@ class Interrupt:
         import onnxruntime as ort
 
         self.options = ort.RunOptions()
+        self.options.log_severity_level = 4  # the caller reports the end of a call
         self.is_set = False
 
     def set(self) -> None:
@@ -94,8 +95,12 @@ class Graph:
         threads: int | None = None,
         provider: str | None = None,
         cores: Collection[int] = (),
+        interrupt: Interrupt | None = None,
     ) -> None:
-        """`cores`: cores of the session's worker threads; empty: those of the opening thread."""
+        """`cores`: cores of the session's worker threads; empty: those of the opening thread.
+
+        `interrupt` ends every call that is given none of its own.
+        """
         import onnxruntime as ort
 
         contract = artifacts.graphs[name]
@@ -138,6 +143,7 @@ class Graph:
                 f"missing or do not load; install those that its package names"
             )
         self.name = name
+        self._interrupt = interrupt
         self.contract = contract
         for declared, found in (
             (contract.inputs, self._session.get_inputs()),
@@ -159,6 +165,7 @@ class Graph:
         self, feeds: Mapping[str, Array], outputs: Sequence[str] | None = None, interrupt: Interrupt | None = None
     ) -> list[Array]:
         """Return outputs (None: all) for named inputs; raises GraphError, or CancelledError when interrupted."""
+        interrupt = interrupt or self._interrupt
         try:
             result: list[Array] = self._session.run(outputs, feeds, interrupt.options if interrupt else None)
         except Exception as error:
@@ -171,6 +178,7 @@ class Graph:
 
     def run_bound(self, binding: Binding, interrupt: Interrupt | None = None) -> None:
         """Run on bound buffers, in place where an input and an output share one; raises as `run` does."""
+        interrupt = interrupt or self._interrupt
         try:
             self._session.run_with_iobinding(binding.buffers, interrupt.options if interrupt else None)
         except Exception as error:

@@ -33,12 +33,16 @@ class Policy:
         provider: str | None = None,
         schedule: Schedule | None = None,
         activity: TickActivity | None = None,
+        interrupt: Interrupt | None = None,
     ) -> None:
-        """`schedule`: where the graphs' own threads run and how urgently; `activity` records every call of a tick."""
+        """`schedule`: where the graphs' own threads run and how urgently; `activity` records every call of a tick.
+
+        `interrupt` ends every call that is given none of its own.
+        """
         control, reasoning = (schedule.control, schedule.reasoning) if schedule else (None, None)
 
         def graph(name: str, cores: Sequence[int]) -> Graph:
-            return Graph(artifacts, name, threads=threads, provider=provider, cores=cores)
+            return Graph(artifacts, name, threads=threads, provider=provider, cores=cores, interrupt=interrupt)
 
         cores = control.cores if control else ()
         self._vision, self._action = run_as(
@@ -48,6 +52,7 @@ class Policy:
         """Whether the semantic context is computed in every tick from the text's waypoints instead of K‖V."""
         role = control if self.guided_by_waypoints else reasoning
         self._context = run_as(role, lambda: graph("semantic_context", role.cores if role else ()))
+        self.artifacts = artifacts
         self._activity = activity or TickActivity(artifacts.runtime.tick_period_ms * 1_000_000)
         self.tokens_shape = zeros(self._vision.contract.output("visual_tokens")).shape
         """Shape of one frame's visual tokens, (1, N, D)."""
@@ -84,9 +89,10 @@ class Policy:
         """
         if self.guided_by_waypoints:
             return {}
-        return self._make_context({"last_layer_kv": last_layer_kv}, interrupt)
+        return self.make_context({"last_layer_kv": last_layer_kv}, interrupt)
 
-    def _make_context(self, feeds: Context, interrupt: Interrupt | None = None) -> Context:
+    def make_context(self, feeds: Context, interrupt: Interrupt | None = None) -> Context:
+        """Run the semantic context's graph on its input by name: K‖V or waypoints."""
         outputs = self._context.run(feeds, interrupt=interrupt)
         return dict(zip(self._context.output_names, outputs, strict=True))
 
@@ -106,7 +112,7 @@ class Policy:
         if self.guided_by_waypoints:
             if semantic.waypoints is None:
                 raise GraphError("the semantic state has no waypoints to be guided by")
-            context = self._make_context({"waypoints": waypoints_now(semantic.waypoints, offset)})
+            context = self.make_context({"waypoints": waypoints_now(semantic.waypoints, offset)})
         if context is not self._bound:
             for name, tensor in context.items():
                 self._acting.bind_ortvalue_input(name, ort.OrtValue.ortvalue_from_numpy(tensor))

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from edge.artifacts.manifest import Artifacts
-from edge.flightlog.records import RecordSink
+from edge.flightlog.recorder import RecordSink
 from edge.inference.generation_task import GenerationModels
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
@@ -58,9 +58,8 @@ class RunOptions:
 
     def switches_for(self, artifacts: Artifacts) -> Switches:
         """Return what is in force with these artifacts; the robot stands at the goal by default. Raises ConfigError."""
-        runtime = artifacts.runtime
         try:
-            return self.switches.over(runtime.decoding, runtime.recovery, stand_at_goal=True)
+            return self.switches.over(artifacts.runtime.switches, stand_at_goal=True)
         except ValueError as error:
             raise ConfigError(f"{artifacts.directory}: {error}") from error
 

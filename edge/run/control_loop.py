@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from edge.core.geometry import SE2
 from edge.core.stats import Samples
-from edge.flightlog.records import RecordSink
+from edge.flightlog.recorder import RecordSink
 from edge.inference.graph import GraphError
 from edge.inference.policy import Policy
 from edge.motion.controller import TARGET_TIME_S, Controller, ControllerInputs, VelocityCommand, is_plan

@@ -5,6 +5,7 @@ Algorithm 4 of the paper. `edge.reasoning.generation_cycle` decides; this shell 
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
@@ -12,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from edge.core.stats import Samples
-from edge.flightlog.records import RecordSink
+from edge.flightlog.recorder import RecordSink
 from edge.inference.generation_task import GENERATION_ERRORS, GenerationModels, GenerationResult, GenerationTask
 from edge.inference.graph import CancelledError, Interrupt
 from edge.inference.scheduling import REASONING_NICENESS, GiveWay, Role, enter
@@ -251,7 +252,13 @@ class ReasoningLoop:
 
         self.busy = True
         started_ns = self._computing.begin()
-        run = self._models.language.begin(cancelled, interrupt=interrupt, before_call=before_call)
+        give_way = self._schedule.give_way
+        run = self._models.language.begin(
+            cancelled,
+            interrupt=interrupt,
+            before_call=before_call,
+            longest_guess_ns=(lambda: math.inf) if give_way is None else give_way.gap_ns,
+        )
         begun_ns = self._ring.newest_ns
         if begun_ns is None:
             raise _MissedFrameError
@@ -344,23 +351,11 @@ class ReasoningLoop:
         """Log a generation that was published; `computed_ns`: when it started and finished."""
         if self._outputs.recorder is None:
             return
-        assert task.anchor is not None
-        frames = [*task.older, task.anchor]
         record = {
-            "generation": state.generation,
-            "anchor_ns": state.anchor_ns,
-            "anchor_pose": state.T_odom_anchor.as_tuple(),
             "started_ns": computed_ns[0],
             "finished_ns": computed_ns[1],
-            "ready_ns": state.ready_ns,
             "release_delay_s": delay_s,
-            "instruction": task.job.instruction,
-            "frames_ns": [frame.stamp_ns for frame in frames],
-            "frame_poses": [frame.T_odom_base.as_tuple() for frame in frames],
-            **task.record(result),
-            "max_new_tokens": task.max_new_tokens,
-            "prefill_ms": result.generation.prefill_ms,
-            "decode_ms": result.generation.decode_ms,
+            **task.state_record(result, state),
             "context_ms": self._context_ns / 1e6,
         }
         self._outputs.recorder.put("/semantic", state.ready_ns, record)

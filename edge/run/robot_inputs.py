@@ -15,7 +15,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.flightlog.records import RecordSink, Throttle, battery_record, odometry_record
+from edge.flightlog.recorder import RecordSink
+from edge.flightlog.records import Throttle, battery_record, odometry_record
 from edge.odometry.calibration import OdometryCalibration, load_calibration
 from edge.odometry.camera_geometry import Attitude, CameraGeometry
 from edge.odometry.estimator import DriftEstimator, OdometryOutputs
@@ -86,6 +87,7 @@ class RobotInputs:
         self._log_odometry, self._log_battery = Throttle(ODOMETRY_LOG_HZ), Throttle(BATTERY_LOG_HZ)
         self._newest: OdometryOutputs | None = None
         self._link = LinkMonitor()
+        self._has_driven = False
         mount = robot.mount
         self._eye: VisualOdometry | None = None
         if mount is not None:
@@ -143,6 +145,9 @@ class RobotInputs:
         self.states += 1
         now_ns = time.monotonic_ns()
         commanded = self._commanded()
+        if not self._has_driven and commanded is not None and any(commanded):
+            # Some robots change the rate of their reports when the bridge arms them: that is no loss.
+            self._has_driven, self._link = True, LinkMonitor()
         outputs = self._newest = self.estimator.step(
             OdometryInputs(
                 received_ns=state.received_ns,

@@ -18,10 +18,10 @@ from edge.core.deadline import Deadline
 from edge.flightlog.recorder import Recorder, space_refusal
 from edge.flightlog.records import RecordSinks
 from edge.inference.graph import GraphError
-from edge.inference.language import ContextOverflowError, LanguageModel
-from edge.inference.policy import Policy
+from edge.inference.language import ContextOverflowError
 from edge.inference.scheduling import TickActivity, enter, freeze_garbage, lock_memory, schedule_for
-from edge.inference.warm_up import check_tick, warm_up
+from edge.inference.start_guard import WARM_UP_S
+from edge.inference.warm_up import check_tick, open_proven, warm_up
 from edge.live.feed import LiveFeed
 from edge.reasoning.generation_cycle import Mode
 from edge.reasoning.prompt import InstructionError
@@ -88,16 +88,19 @@ class RunSession:
                 f"--mode {Mode.NO_REASONING.value}: {artifacts.directory} is guided by the waypoints that reasoning "
                 f"writes; run it with {Mode.ASYNC.value} or {Mode.SYNC.value}"
             )
-        options.switches_for(artifacts)
+        switches = options.switches_for(artifacts)
         activity = TickActivity(self._period_ns)
-        policy = Policy(artifacts, schedule=self._schedule, activity=activity)
-        language = LanguageModel(artifacts, schedule=self._schedule)
+        opened = open_proven(artifacts, schedule=self._schedule, activity=activity)
+        policy, language = opened.policy, opened.language
+        self._lines.append(f"self-test: {opened.tested}")
         language.check_instruction(options.instruction)
         try:
-            tick_ms = warm_up(policy, language, runtime.image_px, len(runtime.frame_offsets_s))
+            with opened.guard.stage("warming up", WARM_UP_S):
+                warm = warm_up(policy, language, switches.speculation)
         except (GraphError, ContextOverflowError) as error:
             raise ArtifactError(f"{artifacts.directory}: the graphs do not run ({error})") from error
-        check_tick(artifacts, tick_ms)
+        self._lines.extend(warm.notes)
+        check_tick(artifacts, warm.tick_ms)
         self._engines = Engines(artifacts, policy, language, self._schedule, activity)
         self._stop, self._finished = threading.Event(), threading.Event()
         self._stop_requested = False

@@ -6,6 +6,8 @@ from pathlib import Path
 
 from tokenizers import Tokenizer
 
+from edge.artifacts.runtime import SPECIAL_TOKENS
+from edge.artifacts.tokenizer_file import TokenizerFileError, check_tokenizer_file
 from export.checkpoint.sources import inside
 from export.model.config import PRESETS, LanguageConfig, TicVlaConfig
 from export.model.tokenizers.internvl import TokenizerError, build_tokenizer
@@ -14,24 +16,20 @@ from export.model.weights import CheckpointError
 
 TOKENIZER = "tokenizer.json"
 MAX_TOKENIZER_BYTES = 64 << 20
-ID_FIELDS = {
-    "im_start_id": "<|im_start|>",
-    "im_end_id": "<|im_end|>",
-    "img_start_id": "<img>",
-    "img_end_id": "</img>",
-    "img_context_id": "<IMG_CONTEXT>",
-}
 
 
 def special_ids(language: LanguageConfig) -> dict[str, int]:
     """Return special token → the network's id of it."""
-    return {token: getattr(language, name) for name, token in ID_FIELDS.items()}
+    return {token: getattr(language, name) for name, token in SPECIAL_TOKENS.items()}
 
 
 def check_tokenizer(content: bytes, language: LanguageConfig, label: str) -> bytes:
     """Return `content` if its special tokens have the network's ids and none is too large. Raises CheckpointError."""
     try:
+        check_tokenizer_file(content, special_ids(language))
         tokenizer = Tokenizer.from_buffer(content)
+    except TokenizerFileError as error:
+        raise CheckpointError(f"{label}: {error}") from error
     except Exception as error:  # the library raises plain Exception for a file it cannot read
         raise CheckpointError(f"{label}: not a tokenizer ({' '.join(str(error).split())[:160]})") from error
     for token, wanted in special_ids(language).items():

@@ -14,7 +14,7 @@ from typing import Any
 
 from edge.artifacts.files import MANIFEST_NAME, SCHEMA_VERSION, ArtifactError, read_manifest, seal
 from edge.artifacts.manifest import load_artifacts
-from export.checkpoint.tokenizer import ID_FIELDS
+from edge.artifacts.runtime import SPECIAL_TOKENS
 from export.core.cache import StageCache, file_sha256, fsync_path, package_versions
 from export.evaluation.gates import WARN, GateResult, require
 from export.graphs.build import graph_contract, graph_parameters
@@ -22,15 +22,17 @@ from export.model.config import TicVlaConfig
 from export.pipeline.build import Pipeline
 from export.pipeline.job import Job
 from export.pipeline.report import report_html
+from export.pipeline.self_test import SELF_TEST_STAGE, known_answers, repeat_self_test
 from export.plan.plan import Plan, plan
 from export.targets.file import Target
+from firmware_bridge.system.input_file import read_json
 from reporting.progress import BuildProgress
 
 REPORT_JSON, REPORT_HTML, TOKENIZER_NAME = "report.json", "report.html", "tokenizer.json"
 NEW, OLD = "new", "old"
-RUNNER_KEYS = ("control_cores", "reasoning_cores", "control_priority", "decoding", "recovery")
+RUNNER_KEYS = ("control_cores", "reasoning_cores", "control_priority", "decoding", "recovery", "speculation")
 SHOWN_CHARACTERS = 60
-OLDER_SCHEMAS = (1, 2)
+OLDER_SCHEMAS = (1, 2, 3)
 """Manifest schemas whose directories an export may replace."""
 
 
@@ -48,7 +50,7 @@ def manifest_runtime(target: Target, config: TicVlaConfig, made: Plan) -> dict[s
         "frame_offsets_s": list(policy.frame_offsets_s),
         "tick_period_ms": policy.tick_period_ms,
         "step_s": config.action.step_s,
-        **{key: getattr(language, key) for key in ID_FIELDS},
+        **{key: getattr(language, key) for key in SPECIAL_TOKENS},
         **{key: getattr(policy, key) for key in RUNNER_KEYS},
     }
 
@@ -122,7 +124,7 @@ def _files_of(out: Path) -> dict[str, Any]:
         return dict(read_manifest(out)["files"])
     except ArtifactError:
         try:
-            older = json.loads((out / MANIFEST_NAME).read_bytes())
+            older = read_json(out / MANIFEST_NAME)
             files = dict(older["files"])
             ours = older["schema_version"] in OLDER_SCHEMAS and all(
                 file_sha256(out / name) == entry["sha256"] for name, entry in files.items()
@@ -170,6 +172,7 @@ def _write_directory(pipeline: Pipeline, directory: Path, progress: BuildProgres
         "runtime": manifest_runtime(job.target, job.config, made),
         "graphs": graphs,
         "plan": made.to_dict(),
+        "self_test": {},
         "provenance": {
             "weights_sha256": weights.sha256,
             "weights_origin": weights.origin,
@@ -182,6 +185,8 @@ def _write_directory(pipeline: Pipeline, directory: Path, progress: BuildProgres
     _write_manifest(directory, manifest)
     for name, result in check_directory(pipeline, directory, progress).items():
         graphs[name]["parity"] = result.to_dict()
+    with progress.stage(SELF_TEST_STAGE):
+        manifest["self_test"] = known_answers(load_artifacts(directory), manifest, half=job.target.half).to_dict()
     with progress.stage("plan and report"):
         decisions = {name: pipeline.decision(name) for name in job.target.graph_names}
         found = {"coverage": weights.coverage, "sensitivity": {k: v for k, v in decisions.items() if v is not None}}
@@ -246,6 +251,8 @@ def verify_directory(job: Job, directory: Path, cache: StageCache, progress: Bui
     for name in job.target.graph_names:
         pipeline.reference(name)
     results = check_directory(pipeline, directory, progress)
+    with progress.stage(SELF_TEST_STAGE):
+        progress.log(f"self-test: {repeat_self_test(load_artifacts(directory))}")
     return {**manifest, "graphs": {n: {**g, "parity": results[n].to_dict()} for n, g in manifest["graphs"].items()}}
 
 

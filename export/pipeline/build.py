@@ -47,6 +47,7 @@ from export.model.weights import weights_sha256
 from export.pipeline.job import Job
 from export.quantize.precision import PRECISIONS, Precision
 from export.quantize.rounding import activation_ranges
+from firmware_bridge.system.input_file import read_json
 from reporting.progress import BuildProgress, Stage
 
 WEIGHTS_FILE = "weights.json"
@@ -75,6 +76,7 @@ EXPECTED_S = {
     "reference": (0.5, 20.0),
     "graph": (0.5, 15.0),
     "gate": (2.0, 45.0),
+    "self-test": (0.5, 20.0),
     "plan and report": (0.2, 1.0),
 }
 """Expected duration of each kind of stage before the first measurement, s: for a small and for a large model."""
@@ -117,7 +119,7 @@ def build_stages(job: Job, known_s: Mapping[str, float], *, graphs: bool = True)
             names += ["activation ranges"]
         names += [f"graph {graph}" for graph in order]
     names += [f"gate {graph}" for graph in order]
-    names += ["plan and report"] if graphs else []
+    names += ["self-test", "plan and report"] if graphs else ["self-test"]
     usual = {name: next(EXPECTED_S[kind][column] for kind in EXPECTED_S if name.startswith(kind)) for name in names}
     return [Stage(name, known_s.get(name, usual[name])) for name in names]
 
@@ -163,7 +165,7 @@ class Pipeline:
         def build(directory: Path) -> None:
             (directory / RESULT_NAME).write_text(json.dumps(compute(), allow_nan=False), encoding="utf-8")
 
-        content: dict[str, Any] = json.loads((self._stage(title, key, build) / RESULT_NAME).read_text(encoding="utf-8"))
+        content: dict[str, Any] = read_json(self._stage(title, key, build) / RESULT_NAME)
         return content
 
     def _key(
@@ -179,7 +181,7 @@ class Pipeline:
 
     def weights(self) -> WeightsRecord:
         """Hash and origin of the weights; raises CheckpointError."""
-        return WeightsRecord(**json.loads((self._weights_entry / WEIGHTS_FILE).read_text(encoding="utf-8")))
+        return WeightsRecord(**read_json(self._weights_entry / WEIGHTS_FILE))
 
     def tokenizer(self) -> bytes:
         """Return tokenizer.json for the weights."""

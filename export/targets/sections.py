@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from edge.state.switches import Decoding, RecoverySwitch
+from edge.artifacts.runtime import MAX_CORES, MAX_FRAMES, OLDEST_FRAME_S, RANGES
+from edge.state.switches import Decoding, RecoverySwitch, Speculation
 from export.core.typed import from_text, near
 from export.quantize.precision import PRECISIONS, Precision, block_size
 from firmware_bridge.core.config import BRIDGE_PRIORITY
@@ -18,10 +20,8 @@ KV_DTYPES = {"fp32": 4, "fp16": 2}
 METERS = ("ina3221", "nvml", "rapl", "none")
 STAGES = ("vision_encoder", "prefill", "decode", "semantic_context", "action_expert")
 SHARING = ("one-device", "own-cores")
-RUNTIME_MOST = {"tick_period_ms": 60_000, "max_new_tokens": 8192, "prefill_chunk_tokens": 8192}
-"""Largest plausible values of [runtime]; a larger one is a typing error."""
-MAX_FRAMES = 16
-MAX_CORES = 1024
+RUNTIME_NUMBERS = ("tick_period_ms", "max_new_tokens", "prefill_chunk_tokens")
+"""Numbers of [runtime] whose ranges are those of the runner."""
 
 
 class TargetError(ValueError):
@@ -318,18 +318,28 @@ class RuntimePolicy:
     """Real-time priority of the control thread, 1 to 59, below the bridge's; 0: none."""
     decoding: str = Decoding.CONSTRAINED.value
     recovery: str = RecoverySwitch.ON.value
+    speculation: str = Speculation.ON.value
     """Defaults of the runner's switches (`edge/state/switches.py`)."""
 
     def __post_init__(self) -> None:
-        for name, most in RUNTIME_MOST.items():
-            value = getattr(self, name)
-            _require(1 <= value <= most, f"{name} {value} must be 1 to {most}")
+        for name in RUNTIME_NUMBERS:
+            value, (least, most) = getattr(self, name), RANGES[name]
+            _require(least <= value <= most, f"{name} {value} must be {least} to {most}")
         count = len(self.frame_offsets_s)
         _require(1 <= count <= MAX_FRAMES, f"frame_offsets_s names {count} frames, expected 1 to {MAX_FRAMES}")
-        _require(all(0 <= offset <= 60 for offset in self.frame_offsets_s), "frame_offsets_s must be 0 to 60 s")
+        _require(
+            all(0 <= offset <= OLDEST_FRAME_S for offset in self.frame_offsets_s),
+            f"frame_offsets_s must be 0 to {OLDEST_FRAME_S:.0f} s",
+        )
+        period_s = self.tick_period_ms / 1e3
+        _require(
+            all(later - earlier >= period_s for earlier, later in itertools.pairwise(self.frame_offsets_s)),
+            f"frame_offsets_s {list(self.frame_offsets_s)} must grow by a tick of {period_s:g} s or more",
+        )
         _known(self.kv_dtype, KV_DTYPES, "kv_dtype")
         _known(self.decoding, tuple(each.value for each in Decoding), "decoding")
         _known(self.recovery, tuple(each.value for each in RecoverySwitch), "recovery")
+        _known(self.speculation, tuple(each.value for each in Speculation), "speculation")
         for name in ("control_cores", "reasoning_cores"):
             cores = getattr(self, name)
             _require(all(0 <= core < MAX_CORES for core in cores), f"{name} {list(cores)} must be 0 to {MAX_CORES - 1}")

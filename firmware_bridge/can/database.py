@@ -100,7 +100,8 @@ class _Loader:
         self._file = _read(can)
         self._messages = {message.name: message for message in self._file.messages}
         nodes = [node.name for node in self._file.nodes]
-        require(can.node in nodes, f"can.node: expected a node of {can.dbc} ({', '.join(nodes)}), found {can.node!r}")
+        known = ", ".join(nodes)
+        require(can.node in nodes, f"can.node: expected a node of {can.dbc.name} ({known}), found {can.node!r}")
 
     def load(self) -> CanDatabase:
         can, signals = self._can, {}
@@ -128,7 +129,7 @@ class _Loader:
     def _message(self, where: str, name: str) -> Message:
         dbc = self._messages.get(name)
         if dbc is None:
-            raise ConfigError(f"{where}: expected a message of {self._can.dbc}, found {name!r}")
+            raise ConfigError(f"{where}: expected a message of {self._can.dbc.name}, found {name!r}")
         standard = not (dbc.is_extended_frame or dbc.is_fd or dbc.is_multiplexed())
         fits = standard and 1 <= dbc.length <= _MOST_BYTES and dbc.frame_id <= _MOST_IDENTIFIER
         form = "a CAN 2.0A message of 1 to 8 bytes with 11 bits of identifier, not multiplexed"
@@ -139,14 +140,14 @@ class _Loader:
         cycle_ns = round((dbc.cycle_time or 0) * _NS_PER_MS)
         cyclic = where == "can.heartbeat" or where.startswith(_CYCLIC)
         timed = cycle_ns > 0 or not cyclic
-        require(timed, f"{where}: {name}: expected a GenMsgCycleTime in {self._can.dbc}, found none")
+        require(timed, f"{where}: {name}: expected a GenMsgCycleTime in {self._can.dbc.name}, found none")
         return Message(name, dbc.frame_id, dbc.length, cycle_ns, self._protection(dbc))
 
     def _signal(self, where: str, text: str) -> Signal:
         name, _, signal_name = text.partition(".")
         message = self._messages.get(name)
         if message is None:
-            raise ConfigError(f"{where}: expected a message of {self._can.dbc}, found {name!r}")
+            raise ConfigError(f"{where}: expected a message of {self._can.dbc.name}, found {name!r}")
         found = [signal for signal in message.signals if signal.name == signal_name]
         if not found:
             names = ", ".join(signal.name for signal in message.signals)

@@ -33,15 +33,11 @@ class BusHealth:
 
     def __init__(self) -> None:
         self.state = "active"  # or "error-passive", "bus-off"
-        self.error_frames = 0
-        self.bus_offs = 0
 
     def note(self, frame: Frame) -> None:
         """Take one error frame."""
-        self.error_frames += 1
         controller = frame.data[_CONTROLLER_BYTE] if len(frame.data) > _CONTROLLER_BYTE else 0
         if frame.identifier & ERROR_BUS_OFF:
-            self.bus_offs += self.state != "bus-off"
             self.state = "bus-off"
         elif frame.identifier & ERROR_RESTARTED:
             self.state = "active"

@@ -40,11 +40,16 @@ class LoopbackMulticastBus(can.BusABC):
         super().__init__(channel)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        return self.receive_from(timeout)[0], False
+
+    def receive_from(self, timeout: float | None) -> tuple[can.Message | None, int]:
+        """Return one frame and the UDP port of its sender; None after `timeout` s or for another datagram."""
         if not select.select([self._socket], [], [], timeout)[0]:
-            return None, False
-        message = unpacked(self._socket.recv(_MAX_DATAGRAM))
+            return None, 0
+        datagram, (_, port) = self._socket.recvfrom(_MAX_DATAGRAM)
+        message = unpacked(datagram)
         self.line_errors += message is None
-        return message, False
+        return message, port
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Send one frame to all members. Raises OSError, also when it would block."""

@@ -115,11 +115,10 @@ class Checker:
         self._protection = protection
         self._last: int | None = None
         self._trusted = False
-        self.lost = 0
         self.newly_lost = 0
 
     def check(self, frame: Frame) -> Verdict:
-        """Check a frame; `newly_lost` is then the number of frames missing before a GOOD one, `lost` their total."""
+        """Check a frame; `newly_lost` is then the number of frames missing before a GOOD one."""
         self.newly_lost = 0
         protection = self._protection
         if len(frame.data) != self._length:
@@ -146,7 +145,6 @@ class Checker:
             self._trusted = True
             return Verdict.GOOD
         self.newly_lost = ahead - 1
-        self.lost += ahead - 1
         return Verdict.GOOD
 
     def forget(self) -> None:

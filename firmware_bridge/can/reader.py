@@ -54,7 +54,6 @@ class Counts:
 
     wrong: int = 0
     wrong_counter: int = 0
-    lost: int = 0
     out_of_range: int = 0
 
 
@@ -173,7 +172,6 @@ class BaseReader:
 
     def _check(self, stream: _Stream, frame: Frame, now_ns: int) -> None:
         verdict = stream.checker.check(frame)
-        self.counts.lost += stream.checker.newly_lost
         self.counts.wrong += verdict in (Verdict.WRONG_CRC, Verdict.WRONG_LENGTH)
         self.counts.wrong_counter += verdict in (Verdict.REPEATED, Verdict.OUT_OF_ORDER)
         if verdict is Verdict.FIRST:

@@ -28,8 +28,6 @@ class TrafficWatch:
     """Load of the bus in the last full second, and the unknown identifier with the most frames."""
 
     def __init__(self, bitrate_bps: int, now_ns: int) -> None:
-        self.load = 0.0
-        self.unknown = 0
         self._bitrate_bps = bitrate_bps
         self._bits = 0
         self._ids: dict[int, int] = {}
@@ -39,23 +37,21 @@ class TrafficWatch:
     def note(self, identifier: int, length: int, *, known: bool) -> None:
         """Count one frame of the bus, received or sent."""
         self._bits += bits_of_frame(length)
-        if not known:
-            self.unknown += 1
-            if identifier in self._ids or len(self._ids) < _MOST_IDS:
-                self._ids[identifier] = self._ids.get(identifier, 0) + 1
+        if not known and (identifier in self._ids or len(self._ids) < _MOST_IDS):
+            self._ids[identifier] = self._ids.get(identifier, 0) + 1
 
     def step(self, now_ns: int) -> str | None:
         """Return one line when the load has become high or normal again."""
         if now_ns < self._end_ns:
             return None
         duration_s = 1.0 + (now_ns - self._end_ns) / 1e9
-        self.load = self._bits / duration_s / self._bitrate_bps
-        ids, was_high, self._high = self._ids, self._high, self.load > _HIGH
+        load = self._bits / duration_s / self._bitrate_bps
+        ids, was_high, self._high = self._ids, self._high, load > _HIGH
         self._bits, self._ids, self._end_ns = 0, {}, now_ns + _WINDOW_NS
         if self._high == was_high:
             return None
         if not self._high:
-            return f"CAN bus load {self.load:.0%}: normal again"
+            return f"CAN bus load {load:.0%}: normal again"
         busiest = max(ids, key=ids.__getitem__, default=None)
         most = "" if busiest is None else f"; most unknown frames have identifier 0x{busiest:x} ({ids[busiest]} in 1 s)"
-        return f"CAN bus load {self.load:.0%}: commands may be late{most}"
+        return f"CAN bus load {load:.0%}: commands may be late{most}"

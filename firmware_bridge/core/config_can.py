@@ -6,7 +6,7 @@ file only; `firmware_bridge/can/database.py` checks these tables against it when
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import ClassVar, Final
 
@@ -207,9 +207,9 @@ class CanAgreement(CanTable):
 class CanConfig(Section):
     """Bus of a wheeled base. `interface` and `channel` are python-can's; `dbc` describes the frames.
 
-    A relative `dbc` is one of the shipped files beside the robot files; a relative serial `channel` is in the user's
-    runtime directory. `node`: our name in the DBC file. `heartbeat`: message that we send at its cycle time. `uptime`:
-    signal of the base's clock. `faults`: signals that stop the robot unless they are 0, as error 101 and up.
+    A relative `dbc` is beside the robot file, else one of the shipped files; a relative serial `channel` is in the
+    user's runtime directory. `node`: our name in the DBC file. `heartbeat`: message that we send at its cycle time.
+    `uptime`: signal of the base's clock. `faults`: signals that stop the robot unless they are 0, as error 101 and up.
     `constants`: "MESSAGE.SIGNAL=NUMBER" of the other signals of our messages. `max_load`: share of `bitrate_bps` that
     the bus's cyclic messages may take. `missing_cycles`: cycle times after which a message counts as missing, at least
     200 ms.
@@ -259,9 +259,18 @@ class CanConfig(Section):
         if self.interface == "serial" and not Path(self.channel).is_absolute():
             object.__setattr__(self, "channel", str(runtime_dir() / self.channel))
 
+    def with_files_of(self, folder: Path) -> CanConfig:
+        """Return this table with the DBC file of the robot file's folder, where it is there."""
+        beside = folder / self.dbc
+        try:
+            found = beside.is_file()
+        except OSError:  # a folder that cannot be read, a name that is too long
+            found = False
+        return replace(self, dbc=beside) if found else self
+
     @property
     def dbc_path(self) -> Path:
-        """Path of the DBC file."""
+        """Path of the DBC file: that of the robot file's folder, else the shipped one."""
         return self.dbc if self.dbc.is_absolute() else ROBOT_FILES / self.dbc
 
     def signals(self) -> dict[str, str]:

@@ -6,7 +6,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
-ARTIFACT_SCHEMA: Final = 3
+ARTIFACT_SCHEMA: Final = 4
 """Version of the manifest's layout that this release reads and writes."""
 _PACKAGE: Final = Path(__file__).resolve().parents[1]
 

@@ -41,8 +41,9 @@ class Expectation:
 def expectations(config: MavlinkConfig) -> tuple[Expectation, ...]:
     """Return what the robot file requires of this autopilot.
 
-    PX4 leaves offboard mode COM_OF_LOSS_T after the last setpoint. ArduPilot Rover stops 3 s after the last one, which
-    no parameter changes (mode_guided.cpp), and reacts to missing heartbeats of the station SYSID_MYGCS.
+    PX4 leaves offboard mode COM_OF_LOSS_T after the last setpoint; COM_DL_LOSS_T watches ground stations only, not the
+    bridge, which is an onboard computer (Commander.cpp, `heartbeat_type_gcs`). ArduPilot Rover stops 3 s after the last
+    setpoint, which no parameter changes (mode_guided.cpp), and reacts to missing heartbeats of the station SYSID_MYGCS.
     """
     if config.autopilot == "ardupilot":
         return (
@@ -55,7 +56,6 @@ def expectations(config: MavlinkConfig) -> tuple[Expectation, ...]:
     return (
         Expectation(("COM_OF_LOSS_T",), most=config.setpoint_loss_max_s, unit=" s"),
         Expectation(("COM_OBL_RC_ACT",), values=(5, 6, 7), meaning="hold, terminate or disarm"),
-        Expectation(("NAV_DLL_ACT",), values=(1, 5, 6), meaning="hold, terminate or disarm without a station"),
         Expectation(("COM_DL_LOSS_T",), most=config.station_loss_max_s, unit=" s"),
     )
 

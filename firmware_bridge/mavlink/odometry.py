@@ -35,6 +35,7 @@ ERROR_NAMES: Final[Mapping[int, str]] = {
 _ODOMETRY, _ATTITUDE, _POSITION, _SYS_STATUS, _BATTERY, _ESTIMATOR, _EKF = 331, 30, 32, 1, 147, 230, 193
 _PREFERRED_NS: Final = 1_000_000_000  # time without ODOMETRY after which LOCAL_POSITION_NED counts
 _ATTITUDE_NS: Final = 200_000_000
+_SAME_TIME_NS: Final = 50_000_000  # stamps this close belong together: a base changes its yaw rate by 0.2 rad/s in it
 _JUMP_NS: Final = 1_000_000_000  # a jump stays an error for this long, so that no step of the rules misses it
 _ESTIMATE_NS: Final = 5_000_000_000  # flags older than this are forgotten: not every firmware sends them again
 _STILL_MPS: Final = 0.05
@@ -108,9 +109,9 @@ class OdometryInput:
         return True
 
     def _state_of(self, motion: Motion, now_ns: int, mode: int = 0, error: int = 0) -> RobotState:
-        attitude = self._attitude
-        fresh = attitude is not None and now_ns - attitude[0] <= _ATTITUDE_NS
-        gyro_radps = attitude[1].wz_radps if fresh and attitude is not None else motion.wz_radps
+        attitude = None if self._attitude is None else self._attitude[1]
+        together = attitude is not None and abs(motion.stamp_ns - attitude.stamp_ns) <= _SAME_TIME_NS
+        gyro_radps = attitude.wz_radps if together and attitude is not None else motion.wz_radps
         velocity = (motion.vx_mps, motion.vy_mps, motion.wz_radps)
         tilt = (motion.position_z_m, motion.roll_rad, motion.pitch_rad, gyro_radps)
         return RobotState(now_ns, motion.T_odom_base, *velocity, mode, error, motion.stamp_ns, *tilt, (0, 0, 0, 0))

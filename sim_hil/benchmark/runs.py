@@ -9,13 +9,13 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from fnmatch import fnmatchcase
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from edge.core.cli import write_whole
 from edge.core.stats import percentiles
+from firmware_bridge.system.input_file import read_json
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.conditions.rewording import reworded
 from sim_hil.benchmark.policies.select import check_artifacts, open_policy
@@ -63,7 +63,7 @@ class BenchRun:
             )
         artifacts = check_artifacts(conditions)
         if artifacts is not None:
-            conditions = conditions.with_defaults_of(artifacts.runtime.decoding, artifacts.runtime.recovery)
+            conditions = conditions.with_defaults_of(artifacts.runtime.switches)
         sha256, trained = ("", True) if artifacts is None else (artifacts.manifest_sha256, artifacts.trained)
         run = BenchRun(suite, tuple(episodes), conditions, sha256, trained)
         run.tasks(Path())
@@ -86,25 +86,14 @@ class BenchRun:
             "versions": versions(),
         }
 
-    def tasks(self, folder: Path, video: str = "none") -> list[EpisodeTask]:
+    def tasks(self, folder: Path, video: str = "none", flights: str = "none") -> list[EpisodeTask]:
         """Return one task per episode, the longest first, for an even load. Raises ConditionsError."""
         tasks = [
-            EpisodeTask(episode, self.conditions, folder, video, self.manifest_sha256) for episode in self.episodes
+            EpisodeTask(episode, self.conditions, folder, video, flights, self.manifest_sha256)
+            for episode in self.episodes
         ]
         # Simulation time grows with the time limit and the crowd.
         return sorted(tasks, key=lambda task: -task.episode.timeout_s * (20 + task.episode.people))
-
-
-def choose(episodes: Sequence[Episode], patterns: Sequence[str]) -> list[Episode]:
-    """Return the episodes whose id matches a pattern, all without patterns. Raises ConditionsError if none matches."""
-    for pattern in patterns:
-        if not any(fnmatchcase(episode.id, pattern) for episode in episodes):
-            some = ", ".join(episode.id for episode in episodes[:3])
-            raise ConditionsError(
-                f"--episodes {pattern!r}: expected a pattern of ids such as {some}, ...; none matches"
-            )
-    wanted = patterns or ("*",)
-    return [episode for episode in episodes if any(fnmatchcase(episode.id, pattern) for pattern in wanted)]
 
 
 def versions() -> dict[str, str]:
@@ -187,6 +176,7 @@ def execute(
     *,
     resume: bool,
     video: str = "none",
+    flights: str = "none",
     stopped: Callable[[], bool],
     watcher: RunWatcher | None = None,
 ) -> Execution:
@@ -196,7 +186,7 @@ def execute(
     try:
         store = (ResultStore.resume if resume else ResultStore.create)(directory, run.config())
         before = len(store.results)
-        tasks = run.tasks(store.directory, video)
+        tasks = run.tasks(store.directory, video, flights)
         finished = run_all(tasks, backend, store, stopped=stopped, watcher=watcher)
     finally:
         backend.close()
@@ -242,5 +232,5 @@ def run_episodes(
 
 def read_result(out: Path) -> dict[str, Any]:
     """Return the content of `result.json` of a finished run."""
-    content: dict[str, Any] = json.loads((out / RESULT).read_text(encoding="utf-8"))
+    content: dict[str, Any] = read_json(out / RESULT)
     return content

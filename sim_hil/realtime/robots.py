@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import os
 import socket
-import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
@@ -14,13 +13,11 @@ from typing import Any, Final
 import tomli_w
 
 import firmware_bridge
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from firmware_bridge.system.input_file import read_toml
 
 ROBOT_FILES: Final = Path(firmware_bridge.__file__).parent / "robots"
+MAX_DOMAIN: Final = 232
+"""Largest DDS domain whose ports exist."""
 BRIDGE_SOCKET: Final = "bridge"
 """Name of the bridge's socket in the folder of a run's sockets."""
 
@@ -41,7 +38,7 @@ class RunAddress:
     """TCP port of the HTTP camera."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.domain <= 232:
+        if not 0 <= self.domain <= MAX_DOMAIN:
             raise ValueError(f"--domain: expected 0 to 232 (DDS), found {self.domain}")
 
     @staticmethod
@@ -52,7 +49,9 @@ class RunAddress:
 
     def filled(self, template: str) -> str:
         """Replace the names of the fields in braces by their values."""
-        return template.format(**vars(self))
+        # One address of 239.74.0.0/16 for each UDP port.
+        can_group = f"239.74.{self.udp_port >> 8}.{self.udp_port & 255}"
+        return template.format(**vars(self), can_group=can_group)
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ class StackRobot:
 
     `hil_robot` and `protocol`: options of edge-hil. `shipped`: robot file of the simulated robot. `hil`: edge-hil's
     further arguments. `values`: keys of the robot file that differ in each run. Both are templates with the fields of
-    `RunAddress` in braces.
+    `RunAddress` in braces. `own_timeout_s`: time without a command after which the robot stops by itself.
     """
 
     name: str
@@ -70,6 +69,7 @@ class StackRobot:
     shipped: str
     hil: tuple[str, ...]
     values: tuple[tuple[str, str], ...]
+    own_timeout_s: float
 
     @property
     def file(self) -> Path:
@@ -87,8 +87,8 @@ class StackRobot:
         Raises StackRobotError if the shipped file cannot be used, OSError if `path` cannot be written.
         """
         try:
-            content = tomllib.loads(self.file.read_text(encoding="utf-8"))
-        except (OSError, tomllib.TOMLDecodeError) as error:
+            content = read_toml(self.file)
+        except (OSError, ValueError) as error:
             raise StackRobotError(f"--robot {self.name}: {self.file}: cannot be read: {error}") from error
         for key, template in (("bridge.socket", f"{{folder}}/{BRIDGE_SOCKET}"), *self.values):
             _put(content, key, address.filled(template))
@@ -107,12 +107,13 @@ def _put(content: dict[str, Any], key: str, value: str | float) -> None:
 
 _CAMERA: Final = ("camera.source", "http://127.0.0.1:{camera_port}/stream.mjpg")
 _DOMAIN: Final = ("dds.domain", "{domain}")
+_ON_LOOPBACK: Final = ("--interface", "lo", "--domain={domain}")
 
 ROBOTS: Mapping[str, StackRobot] = MappingProxyType(
     {
         robot.name: robot
         for robot in (
-            StackRobot("go2", "go2", "unitree", "go2_sim.toml", ("--interface", "lo", "--domain={domain}"), (_DOMAIN,)),
+            StackRobot("go2", "go2", "unitree", "go2_sim.toml", _ON_LOOPBACK, (_DOMAIN,), 1.0),
             StackRobot(
                 "carter-can",
                 "carter",
@@ -120,6 +121,7 @@ ROBOTS: Mapping[str, StackRobot] = MappingProxyType(
                 "carter_can_sim.toml",
                 ("--link=serial:{folder}/can,camera={camera_port}",),
                 (("can.channel", "{folder}/can"), ("can.dbc", str(ROBOT_FILES / "carter.dbc")), _CAMERA),
+                0.1,
             ),
             StackRobot(
                 "carter-mavlink",
@@ -128,14 +130,16 @@ ROBOTS: Mapping[str, StackRobot] = MappingProxyType(
                 "carter_mavlink_sim.toml",
                 ("--link=udp:127.0.0.1:{udp_port},camera={camera_port}",),
                 (("mavlink.link", "udp:127.0.0.1:{udp_port}"), _CAMERA),
+                0.5,
             ),
             StackRobot(
                 "carter-ros2",
                 "carter",
                 "ros2",
                 "carter_ros2_sim.toml",
-                ("--interface", "lo", "--domain={domain}"),
+                _ON_LOOPBACK,
                 (_DOMAIN,),
+                0.5,
             ),
         )
     }
@@ -143,6 +147,20 @@ ROBOTS: Mapping[str, StackRobot] = MappingProxyType(
 """Every robot by name."""
 
 GO2: Final = ROBOTS["go2"]
+CAN_BETWEEN_PROCESSES: Final = replace(
+    ROBOTS["carter-can"],
+    hil=("--link=udp_multicast:{can_group},camera={camera_port}",),
+    values=(("can.interface", "udp_multicast"), ("can.channel", "{can_group}"), *ROBOTS["carter-can"].values[1:]),
+)
+"""The robot on CAN with a bus that further processes can join: a sniffer, a second controller."""
+MAVLINK_KEY: Final = "mavlink.key"
+"""Name of the signing key in the folder of a run's sockets, for MAVLINK_SIGNED."""
+MAVLINK_SIGNED: Final = replace(
+    ROBOTS["carter-mavlink"],
+    hil=(f"{ROBOTS['carter-mavlink'].hil[0]},key={{folder}}/{MAVLINK_KEY}",),
+    values=(*ROBOTS["carter-mavlink"].values, ("mavlink.signing_key", f"{{folder}}/{MAVLINK_KEY}")),
+)
+"""The robot on MAVLink with a signed link."""
 
 
 def robot_of(name: str) -> StackRobot:

@@ -26,6 +26,17 @@ def test_a_relative_socket_lies_in_the_runtime_directory(monkeypatch: pytest.Mon
     assert load_robot_config(GO2_SIM).bridge.socket == tmp_path / "tic-vla-edge" / "bridge.sock"
 
 
+def test_a_dbc_file_is_that_of_the_robot_files_folder_else_the_shipped_one(tmp_path: Path) -> None:
+    shipped = GO2_SIM.with_name("example_can.toml")
+    copied, mine = tmp_path / "base.toml", tmp_path / "example_base.dbc"
+    copied.write_text(shipped.read_text())
+    before = load_robot_config(copied).can
+    mine.write_text(shipped.with_name("example_base.dbc").read_text())
+    after = load_robot_config(copied).can
+    assert before is not None and before.dbc_path == shipped.with_name("example_base.dbc")
+    assert after is not None and after.dbc_path == mine
+
+
 def test_arguments_override_socket_and_domain(tmp_path: Path) -> None:
     config = load_robot_config(GO2_SIM, socket=tmp_path / "s", domain=7)
     assert (config.bridge.socket, config.dds.domain) == (tmp_path / "s", 7)

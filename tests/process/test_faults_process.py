@@ -12,10 +12,11 @@ from pathlib import Path
 import pytest
 
 from edge.flightlog.recorder import space_refusal
+from sim_hil.realtime.robots import ROBOTS
 from sim_hil.realtime.stack import socket_dir
 from tools.faults.__main__ import run_row
 from tools.faults.host_stall import HostStall
-from tools.faults.rig import Rig
+from tools.faults.rig.processes import Rig
 from tools.faults.rows import rows
 
 pytestmark = pytest.mark.process
@@ -27,6 +28,33 @@ ROWS = {row.name: row for row in rows()}
 def host() -> Iterator[HostStall]:
     with HostStall() as watching:
         yield watching
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)
+@pytest.mark.parametrize(
+    ("robot", "names"),
+    [
+        (
+            "carter-can",
+            ("bridge SIGKILL", "bus-off", "every frame corrupted", "second commander", "link dead both ways"),
+        ),
+        ("carter-mavlink", ("bridge SIGKILL", "link dead both ways")),
+        ("carter-ros2", ("bridge SIGKILL", "second commander", "link dead both ways")),
+    ],
+)
+def test_a_wheeled_base_is_stopped_within_the_rows_bound(
+    robot: str, names: tuple[str, ...], artifacts_dir: Path, host: HostStall
+) -> None:
+    of = {row.name: row for row in rows(ROBOTS[robot])}
+    with (
+        socket_dir() as folder,
+        Rig(folder, artifacts_dir, None, print, record=False, stack_robot=ROBOTS[robot]) as rig,
+    ):
+        rig.start()
+        for name in names:
+            result = run_row(rig, of[name], 1, random.Random(name), host)
+            assert not result.problems, (name, result.as_json())
 
 
 @pytest.fixture(scope="module")
@@ -55,4 +83,32 @@ def rig(artifacts_dir: Path, dds_domain: int, host: HostStall) -> Iterator[Rig]:
 )
 def test_the_robot_is_stopped_within_the_rows_bound(name: str, rig: Rig, host: HostStall) -> None:
     result = run_row(rig, ROWS[name], 1, random.Random(name), host)
+    assert not result.problems, result.as_json()
+
+
+@pytest.fixture(scope="module")
+def rover(artifacts_dir: Path, host: HostStall) -> Iterator[Rig]:
+    with (
+        socket_dir() as folder,
+        Rig(folder, artifacts_dir, None, print, record=False, stack_robot=ROBOTS["carter-mavlink"]) as rig,
+    ):
+        rig.start()
+        yield rig
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    [
+        "unsigned packets",
+        "packets with another key",
+        "recorded packets again",
+        "packets of another system",
+        "pilot's mode switch",
+        "second commander",
+    ],
+)
+def test_a_rover_on_a_signed_link_keeps_the_rows_bound(name: str, rover: Rig, host: HostStall) -> None:
+    (row,) = [row for row in rows(rover.stack_robot) if row.name == name]
+    result = run_row(rover, row, 1, random.Random(name), host)
     assert not result.problems, result.as_json()

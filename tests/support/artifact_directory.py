@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import onnx
 
 from edge.artifacts.files import MANIFEST_NAME, SCHEMA_VERSION, seal
 from export.graphs.build import graph_contract, write_graph
@@ -15,12 +19,21 @@ from export.model.tokenizers.nano import NANO_TOKENIZER
 from export.quantize.precision import Precision
 from export.targets.file import graph_names
 
+Floats = npt.NDArray[np.float32]
 
-def write_artifacts(model: TicVla, directory: Path, *, pair: bool = False, precision: Precision | None = None) -> Path:
-    """The graphs of a model with nano's tokenizer, in one precision, and a manifest that lists them."""
-    config, graphs = model.config, {}
+
+def write_artifacts(
+    model: TicVla,
+    directory: Path,
+    *,
+    pair: bool = False,
+    precision: Precision | None = None,
+    precisions: Mapping[str, Precision] | None = None,
+) -> Path:
+    """The graphs of a model with nano's tokenizer, in one precision but for `precisions`, and their manifest."""
+    config, graphs, chosen = model.config, {}, precisions or {}
     for name in graph_names(pair=pair):
-        files = write_graph(model, name, precision or Precision("fp32"), "fused", directory)
+        files = write_graph(model, name, chosen.get(name, precision or Precision("fp32")), "fused", directory)
         session = {"provider": "CPUExecutionProvider", "options": {}, "threads": None, "engine": False}
         graphs[name] = {
             "file": files[0],
@@ -57,6 +70,7 @@ def write_artifacts(model: TicVla, directory: Path, *, pair: bool = False, preci
         "graphs": graphs,
         "files": files_section,
         "plan": {},
+        "self_test": {},
         "provenance": {},
     }
     (directory / MANIFEST_NAME).write_text(json.dumps(seal(manifest)))
@@ -76,6 +90,22 @@ def replace_file(directory: Path, name: str, data: bytes) -> None:
     (directory / name).write_bytes(data)
     entry = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
     edit_manifest(directory, lambda m: m["files"].update({name: entry}))
+
+
+def edit_graph(directory: Path, name: str, change: Callable[[onnx.ModelProto], object]) -> None:
+    """Change a graph and list its new hash, as somebody who damages both would."""
+    model = onnx.load(str(directory / f"{name}.onnx"))
+    change(model)
+    replace_file(directory, f"{name}.onnx", model.SerializeToString())
+
+
+def change_weight(model: onnx.ModelProto, change: Callable[[Floats], object]) -> None:
+    """Change the largest weight matrix of a graph in place."""
+    floats = [t for t in model.graph.initializer if t.data_type == onnx.TensorProto.FLOAT and len(t.dims) == 2]
+    tensor = max(floats, key=lambda tensor: len(tensor.raw_data))
+    values = onnx.numpy_helper.to_array(tensor).copy()
+    change(values)
+    tensor.raw_data = values.tobytes()
 
 
 def flip_bit(directory: Path, name: str) -> None:

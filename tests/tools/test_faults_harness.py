@@ -5,21 +5,30 @@ from __future__ import annotations
 import json
 import math
 import random
+import time
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from edge.core.geometry import SE2
 from edge.motion.controller import arc_to
 from edge.safety.faults.table import FAULTS
+from firmware_bridge.core.config import load_robot_config
+from sim_hil.protocols.can.node import COMMAND_TIMEOUT_S
 from sim_hil.protocols.fault_socket import FaultClient, FaultError
+from sim_hil.protocols.mavlink.parameters import TABLE
+from sim_hil.protocols.ros2.front_end import BASE_TIMEOUT_S
+from sim_hil.realtime.robots import ROBOTS, StackRobot
 from tools.faults import __main__ as command
-from tools.faults import circle
 from tools.faults.measure import Sample
-from tools.faults.received import ReceivedCommands, first_lasting, longest_gap_ms
-from tools.faults.report import RowResult
-from tools.faults.rows import NOT_INJECTED, Judge, Row, rows
-from tools.faults.switches import Switches
+from tools.faults.report import RowResult, markdown, read_results, result
+from tools.faults.rig import circle, driver
+from tools.faults.rig.received import ReceivedCommands, first_lasting, longest_age_ms, longest_gap_ms
+from tools.faults.rig.switches import Switches
+from tools.faults.rows import CONTRACT, NOT_INJECTED, Judge, Row, rows
 
 MS = 1_000_000
 ZERO, SLOW, FAST = (0.0, 0.0, 0.0), (0.3, 0.0, 0.2), (0.7, 0.0, 0.7)
@@ -44,6 +53,30 @@ def test_a_gap_counts_from_the_beginning_and_to_the_end_of_the_window() -> None:
     assert longest_gap_ms([(30 * MS, FAST), (50 * MS, FAST)], 0, 60 * MS) == 30.0
     assert longest_gap_ms([(30 * MS, FAST)], 0, 100 * MS) == 70.0
     assert longest_gap_ms([], 0, 100 * MS) == 100.0
+
+
+@pytest.mark.parametrize(
+    ("received", "obeys", "age_ms"),
+    [
+        ([0, 20, 40, 60, 80], [(-5, True)], 20.0),
+        ([0, 20], [(-5, True), (50, False)], 30.0),
+        ([0, 20], [(-5, True), (50, False), (90, True)], 80.0),
+        ([0], [(-5, True), (5, False)], 0.0),
+        ([0], [(-5, True)], 100.0),
+    ],
+    ids=[
+        "commands at 50 Hz",
+        "a robot that stops by itself",
+        "a robot that obeys an old command again",
+        "a robot that stood before the window",
+        "a robot that drives on without a command",
+    ],
+)
+def test_the_age_of_a_command_counts_only_while_the_robot_obeys_motion(
+    received: list[int], obeys: list[tuple[int, bool]], age_ms: float
+) -> None:
+    stamps, changes = [t * MS for t in received], [(t * MS, moving) for t, moving in obeys]
+    assert longest_age_ms(stamps, changes, 10 * MS, 100 * MS) == age_ms
 
 
 def row(bound: float = 300.0) -> Row:
@@ -81,11 +114,71 @@ def test_time_that_the_machine_stood_still_is_granted_and_counted() -> None:
     assert result.granted == 1 and result.as_json()["max_ms"] == 310.0
 
 
+@pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
+def test_every_robot_has_rows_of_its_own_and_of_the_contract(robot: StackRobot) -> None:
+    names = [one.name for one in rows(robot)]
+    assert len(set(names)) == len(names)
+    assert {"runner SIGKILL", "bridge SIGSTOP", "link dead both ways", "battery at 3 %"} <= CONTRACT.intersection(names)
+
+
+def test_every_row_of_the_contract_belongs_to_a_robot() -> None:
+    assert {one.name for robot in ROBOTS.values() for one in rows(robot)} >= CONTRACT
+
+
+def test_the_timeout_that_a_row_expects_of_a_robot_is_the_simulated_ones() -> None:
+    assert ROBOTS["carter-can"].own_timeout_s == COMMAND_TIMEOUT_S
+    assert ROBOTS["carter-mavlink"].own_timeout_s == TABLE["COM_OF_LOSS_T"].default
+    assert ROBOTS["carter-ros2"].own_timeout_s == BASE_TIMEOUT_S
+
+
+def test_a_robot_stops_by_itself_no_later_than_its_robot_file_states() -> None:
+    can, ros2, mavlink = (load_robot_config(ROBOTS[f"carter-{name}"].file) for name in ("can", "ros2", "mavlink"))
+    assert can.can is not None and ros2.ros2 is not None and mavlink.mavlink is not None
+    assert 1000 * ROBOTS["carter-can"].own_timeout_s <= can.can.command.base_timeout_ms
+    assert 1000 * ROBOTS["carter-ros2"].own_timeout_s <= ros2.ros2.base_timeout_ms
+    assert ROBOTS["carter-mavlink"].own_timeout_s <= mavlink.mavlink.setpoint_loss_max_s
+
+
+def test_a_resumed_call_reads_the_rows_that_it_had_written(tmp_path: Path) -> None:
+    one = RowResult(rows()[0], [Sample(100.0, 1.0), Sample(None, 0.0, ["wrong"])], 1, 7.5)
+    (tmp_path / "faults.json").write_text(json.dumps(result([one], {}, "go2")))
+    [read] = read_results(tmp_path / "faults.json", rows())
+    assert read.as_json() == one.as_json() and read.row.name == one.row.name
+    assert read_results(tmp_path / "none.json", rows()) == []
+    (tmp_path / "faults.json").write_text("[]")
+    with pytest.raises(ValueError, match="leave out --resume"):
+        read_results(tmp_path / "faults.json", rows())
+
+
+def test_a_resumed_row_makes_only_the_missing_injections(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[int] = []
+    monkeypatch.setattr(command, "attempt", lambda *_: made.append(1) or Sample(50.0, 0.0))
+    counts: list[int] = []
+    kept = RowResult(row(), [Sample(100.0, 0.0)] * 3, 1)
+    arguments: tuple[Any, ...] = (None, row(), 5, random.Random(0), None)
+    done = command.run_row(*arguments, kept=kept, keep=lambda one: counts.append(len(one.samples)))
+    assert len(made) == 2 and counts == [4, 5] and len(done.samples) == 5 and done.repeated == 1
+    assert len(command.run_row(*arguments, kept=done).samples) == 5 and len(made) == 2
+
+
+def test_the_table_has_a_row_for_each_fault_and_a_column_for_each_robot() -> None:
+    go2 = result([RowResult(rows()[0], [Sample(100.0, 0.0), Sample(200.0, 0.0)], 0, 1.0)], {}, "go2")
+    can = result([RowResult(replace(row(), name="other"), [Sample(400.0, 0.0)], 0, 2.0)], {}, "carter-can")
+    assert markdown([go2, can]).splitlines() == [
+        "| fault | judged | go2 | carter-can |",
+        "|---|---|---|---|",
+        "| camera stops | zero | ≤ 500: 200 / 200, n 2 | – |",
+        "| other | zero | – | ≤ 300: 400 / 400, n 1 **failed** |",
+        "",
+        "Load of the machine (1 min): go2 1.0 to 1.0, carter-can 2.0 to 2.0.",
+    ]
+
+
 def test_every_fault_of_the_table_is_injected_or_says_why_not() -> None:
-    injected = {one.fault for one in rows()}
+    injected = {one.fault for robot in ROBOTS.values() for one in rows(robot)}
     movable = {name for name, fault in FAULTS.items() if fault.where != "start"}
     assert movable - injected <= set(NOT_INJECTED)
-    assert not injected & set(NOT_INJECTED)
+    assert not {one.fault for one in rows()} & set(NOT_INJECTED)
 
 
 def test_a_row_must_have_a_criterion_and_name_a_known_fault() -> None:
@@ -182,3 +275,38 @@ def test_a_robot_that_does_not_drive_on_fails_a_row_only_twice_in_a_row(
     result = command.run_row(rig, row(), 1, random.Random(0), None)  # type: ignore[arg-type]
     assert result.repeated == repeated and (not result.problems) == passes
     assert len(result.samples) == 1 + repeated
+
+
+class FakeBridge:
+    """A bridge that needs an operator, arms in the third step and stops the robot in the sixth."""
+
+    def __init__(self, _path: Path) -> None:
+        self.polls, self.arms = 0, 0
+        self.velocities: list[tuple[float, float]] = []
+
+    def poll(self) -> SimpleNamespace:
+        self.polls += 1
+        state = "disarmed" if self.polls < 3 else "armed" if self.polls < 6 else "stopped"
+        return SimpleNamespace(state=state, reason="bus-off", permit="needed")
+
+    def arm(self) -> None:
+        self.arms += 1
+
+    def send_velocity(self, _seq: int, _stamp_ns: int, vx_mps: float, _vy_mps: float, wz_radps: float) -> None:
+        self.velocities.append((vx_mps, wz_radps))
+
+
+@pytest.mark.parametrize(("age_s", "drives"), [(0.0, True), (0.6, False)])
+def test_the_runners_stand_in_drives_from_a_fresh_pose_once_armed_until_the_bridge_stops_it(
+    age_s: float, drives: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bridge = FakeBridge(Path())
+    state = SimpleNamespace(received_ns=time.monotonic_ns() - round(age_s * 1e9), T_odom_base=(1.0, 0.0, math.pi / 2))
+    monkeypatch.setattr(driver, "BridgeClient", lambda _path: bridge)
+    monkeypatch.setattr(driver, "_reader", lambda _config: SimpleNamespace(state=lambda: state))
+    monkeypatch.setattr(driver, "_PERIOD_NS", 1_000_000)
+    config = SimpleNamespace(bridge=SimpleNamespace(socket="bridge"))
+    assert driver.drive(config) == "bus-off"  # type: ignore[arg-type]
+    assert bridge.arms == 1 and capsys.readouterr().err == "driver: waiting for `edge-bridge arm`\n"
+    assert bridge.velocities[:2] == [(0.0, 0.0)] * 2 and len(bridge.velocities) == 5
+    assert all((vx > 0.5 and wz > 0.3) == drives for vx, wz in bridge.velocities[2:])

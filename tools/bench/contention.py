@@ -37,7 +37,7 @@ from sim_hil.realtime.stack import socket_dir
 from tools.bench import bad_input, command_parser
 from tools.bench.stop import start_robot
 from tools.demo import INSTRUCTION
-from tools.faults import circle
+from tools.faults.rig import circle
 
 BLOCK_S = 8.0
 """Length of a block, s: shorter than the age of a semantic state at which the robot slows down."""

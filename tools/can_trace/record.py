@@ -29,7 +29,7 @@ from firmware_bridge.can.multicast import LoopbackMulticastBus
 from firmware_bridge.can.serial_line import SerialFrames
 from firmware_bridge.client import BridgeClient, BridgeUnavailable
 from sim_hil.protocols.can.pty_line import PtyLine
-from sim_hil.realtime.children import Child, Children, StepError
+from sim_hil.realtime.children import Children, StepError, Tick
 from sim_hil.realtime.robots import BRIDGE_SOCKET, RunAddress, robot_of
 from sim_hil.realtime.stack import BRIDGE_TIMEOUT_S, COMMANDS, GRACE_S, READY_LINE, READY_TIMEOUT_S
 
@@ -142,11 +142,17 @@ def _drive(client: BridgeClient, tap: Tap, trace: TextIO, duration_s: float, hea
     return stops
 
 
-def _start(children: Children, name: str, arguments: Sequence[str], ready: Callable[[Child], bool]) -> Child:
+def _discard(tap: Tap) -> None:
+    """Let frames pass that belong to no trace: those before the bridge is there."""
+    while tap.take():
+        pass
+
+
+def _start(children: Children, name: str, arguments: Sequence[str], ready: str, tick: Tick) -> None:
     child = children.start(name, [*COMMANDS[name], *arguments])
     timeout_s = READY_TIMEOUT_S if name == "edge-hil" else BRIDGE_TIMEOUT_S
-    children.wait_until(child, lambda: ready(child), timeout_s, "ready", lambda: None)
-    return child
+    is_ready = lambda: ready in child.log.read_text(encoding="utf-8")  # noqa: E731 - one line, used once
+    children.wait_until(child, is_ready, timeout_s, f"line {ready!r}", tick)
 
 
 def record(interface: str, duration_s: float, out: Path) -> int:
@@ -163,16 +169,16 @@ def record(interface: str, duration_s: float, out: Path) -> int:
         hil = ["--robot", "carter", "--protocol", "can", "--scene", "corridor", "--camera", "none"]
         hil += ["--link", f"{interface}:{robot_line}", "--json", str(out / "edge-hil.json")]
         listener = MulticastTap(group) if interface == "udp_multicast" else None
-        _start(children, "edge-hil", hil, lambda child: READY_LINE in child.log.read_text(encoding="utf-8"))
+        _start(children, "edge-hil", hil, READY_LINE, lambda: None)
         tap: Tap = listener or SerialTap(folder / "can", folder / "tap")
         client = None
         try:
             path = folder / BRIDGE_SOCKET
             bridge = ["--robot", str(out / "robot.toml"), "--json", str(out / "edge-bridge.json")]
-            _start(children, "edge-bridge", bridge, lambda _: path.exists())
+            _start(children, "edge-bridge", bridge, "ready, robot", lambda: _discard(tap))
             client = BridgeClient(path)
             with open_stream(out / "trace.log") as trace:
-                tap.take()  # what has passed before the bridge was there
+                _discard(tap)
                 return _drive(client, tap, trace, duration_s, lambda: children.check_others(None))
         finally:
             if client is not None:

@@ -8,36 +8,42 @@ from __future__ import annotations
 
 import argparse
 import fnmatch
+import json
+import os
 import random
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
 
+from edge.artifacts.files import read_manifest
 from edge.core.cli import (
     EXIT_BAD_INPUT,
     EXIT_CHECK_FAILED,
     EXIT_DONE,
     EXIT_INTERRUPTED,
+    check_result_directory,
     check_result_target,
     command_line,
     messages,
     write_result,
 )
 from edge.flightlog.recorder import space_refusal
+from firmware_bridge.system.terminal import CommandParser
 from sim_hil.protocols.fault_socket import FaultError
 from sim_hil.realtime.children import StepError, uninterrupted
-from sim_hil.realtime.robots import GO2, ROBOTS
+from sim_hil.realtime.robots import GO2, MAX_DOMAIN, ROBOTS, StackRobot
 from sim_hil.realtime.stack import socket_dir
 from tools.faults.host_stall import HostStall
 from tools.faults.measure import Sample, injection
-from tools.faults.report import RowResult, result, show
-from tools.faults.rig import Rig
-from tools.faults.rows import Judge, Row, rows
+from tools.faults.report import RowResult, markdown, read_results, result, show
+from tools.faults.rig.processes import Rig
+from tools.faults.rows import CONTRACT, Judge, Row, rows
 from tools.report.machine import machine_facts
 
 _print = messages("faults")
@@ -45,13 +51,15 @@ _print = messages("faults")
 EXAMPLES = """examples:
   python -m tools.faults --artifacts out/nano --out out/faults
   python -m tools.faults --artifacts out/nano --out out/faults --rows "camera*" --rows "runner SIG*" --per-row 20
+  python -m tools.faults --robot carter-can --contract --per-row 20 --artifacts out/nano --out out/contract/carter-can
+  python -m tools.faults --table out/contract/go2 out/contract/carter-can
   python -m tools.faults --list
 exit codes: 0 every bound held, 1 a bound did not hold or an injection failed, 2 bad arguments, 130 interrupted"""
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the argument parser."""
-    p = argparse.ArgumentParser(
+    p = CommandParser(
         "python -m tools.faults",
         description=__doc__,
         epilog=EXAMPLES,
@@ -66,14 +74,25 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--seed", type=int, default=0, help="seed of the injection times (default: 0)")
     p.add_argument("--robot", choices=tuple(ROBOTS), default=GO2.name, help=f"robot to drive (default: {GO2.name})")
     p.add_argument("--domain", type=int, metavar="N", help="DDS domain of a robot with DDS (default: a free one)")
+    p.add_argument(
+        "--contract", action="store_true", help="only the rows of the table of backends and faults, all N times"
+    )
+    p.add_argument(
+        "--resume", action="store_true", help="keep the injections that --out already has, and make the missing ones"
+    )
+    p.add_argument(
+        "--table", nargs="+", type=Path, metavar="DIR", help="print the results in these folders as a table, and exit"
+    )
     p.add_argument("--list", action="store_true", help="print the rows with their criteria and exit")
     p.add_argument("--json", metavar="FILE|-", help="also write the result to this file; - is stdout")
     return p
 
 
-def chosen(globs: Sequence[str] | None) -> list[Row]:
-    """Return the rows whose names match. Raises ValueError if a pattern matches none."""
-    everything = rows()
+def chosen(globs: Sequence[str] | None, robot: StackRobot = GO2, *, contract: bool = False) -> list[Row]:
+    """Return the robot's rows whose names match. Raises ValueError if a pattern matches none."""
+    everything = rows(robot)
+    if contract:
+        everything = tuple(replace(row, share=1.0) for row in everything if row.name in CONTRACT)
     for glob in globs or ():
         if not any(fnmatch.fnmatch(row.name, glob) for row in everything):
             raise ValueError(f"--rows {glob!r}: no such row; see --list")
@@ -85,11 +104,24 @@ def count(row: Row, per_row: int) -> int:
     return max(1, round(row.share * per_row))
 
 
-def run_row(rig: Rig, row: Row, times: int, rng: random.Random, host: HostStall) -> RowResult:
-    """Make all injections of one row. Raises FaultError if the robot's side does not answer."""
-    samples: list[Sample] = []
-    repeated = 0
-    for index in range(times):
+def run_row(
+    rig: Rig,
+    row: Row,
+    times: int,
+    rng: random.Random,
+    host: HostStall,
+    *,
+    kept: RowResult | None = None,
+    keep: Callable[[RowResult], None] = lambda result: None,
+) -> RowResult:
+    """Make all injections of one row. Raises FaultError if the robot's side does not answer.
+
+    `kept`: the row's result of an earlier call, which counts; `keep` takes the result after every injection.
+    """
+    samples = [] if kept is None else list(kept.samples)
+    repeated = 0 if kept is None else kept.repeated
+    done = RowResult(row, samples, repeated, 0.0 if kept is None else kept.load)
+    for index in range(len(samples), times):
         sample = attempt(rig, row, rng, host)
         _show(row, f"{index + 1}/{times}", sample)
         if sample.hindered:
@@ -100,7 +132,9 @@ def run_row(rig: Rig, row: Row, times: int, rng: random.Random, host: HostStall)
             _show(row, f"{index + 1}/{times} again", sample)
             sample.wrong += sample.hindered
         samples.append(sample)
-    return RowResult(row, samples, repeated)
+        done = RowResult(row, samples, repeated, round(os.getloadavg()[0], 1))
+        keep(done)
+    return done
 
 
 def attempt(rig: Rig, row: Row, rng: random.Random, host: HostStall) -> Sample:
@@ -128,8 +162,13 @@ def run(args: argparse.Namespace, wanted: Sequence[Row]) -> list[RowResult]:
 
     Raises StepError if no flight could be recorded, FaultError if edge-hil does not answer.
     """
-    results: list[RowResult] = []
-    robot = ROBOTS[args.robot]
+    robot, file = ROBOTS[args.robot], args.out / "faults.json"
+    results = {one.row.name: one for one in (read_results(file, rows(robot)) if args.resume else [])}
+
+    def keep(one: RowResult) -> None:
+        results[one.row.name] = one
+        write_result(str(file), result(list(results.values()), machine_facts(), robot.name))
+
     with ExitStack() as stack:
         folder = stack.enter_context(socket_dir())
         refusal = space_refusal(folder / "flight.mcap")
@@ -142,9 +181,8 @@ def run(args: argparse.Namespace, wanted: Sequence[Row]) -> list[RowResult]:
         rig.start()
         rng = random.Random(args.seed)
         for row in wanted:
-            results.append(run_row(rig, row, count(row, args.per_row), rng, host))
-            write_result(str(args.out / "faults.json"), result(results, machine_facts()))
-    return results
+            run_row(rig, row, count(row, args.per_row), rng, host, kept=results.get(row.name), keep=keep)
+    return list(results.values())
 
 
 def keep_logs(folder: Path, out: Path) -> None:
@@ -163,12 +201,20 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     args = parser().parse_args(argv)
     try:
-        wanted = chosen(args.rows)
+        wanted = chosen(args.rows, ROBOTS[args.robot], contract=args.contract)
         check_result_target(args.json)
         if args.per_row < 1:
             raise ValueError(f"--per-row {args.per_row}: expected at least 1")
+        if args.table is not None:
+            print(markdown([json.loads((folder / "faults.json").read_text("utf-8")) for folder in args.table]))
+            return EXIT_DONE
         if not args.list and (args.artifacts is None or not args.artifacts.is_dir()):
             raise ValueError(f"--artifacts {args.artifacts}: expected a directory made by edge-export")
+        if not args.list:
+            read_manifest(args.artifacts)
+        check_result_directory(args.out)
+        if args.domain is not None and not 0 <= args.domain <= MAX_DOMAIN:
+            raise ValueError(f"--domain: expected 0 to {MAX_DOMAIN}, found {args.domain}")
         args.out.mkdir(parents=True, exist_ok=True)
     except (ValueError, OSError) as error:
         _print(str(error))
@@ -183,10 +229,10 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         _print(f"interrupted, all processes ended; the results so far are in {args.out}")
         return EXIT_INTERRUPTED
-    except (StepError, FaultError, OSError) as error:
+    except (StepError, FaultError, OSError, ValueError) as error:
         _print(str(error))
         return EXIT_CHECK_FAILED
-    summary = result(results, machine_facts())
+    summary = result(results, machine_facts(), args.robot)
     write_result(args.json, summary)
     show(results, Console(stderr=args.json == "-", width=150))
     return EXIT_DONE if summary["pass"] else EXIT_CHECK_FAILED

@@ -8,8 +8,8 @@ import time
 from dataclasses import dataclass, field
 
 from tools.faults.host_stall import HostStall
-from tools.faults.received import ReceivedCommand, first_lasting, longest_gap_ms, moves
-from tools.faults.rig import Rig
+from tools.faults.rig.processes import Rig
+from tools.faults.rig.received import ReceivedCommand, first_lasting, longest_age_ms, longest_gap_ms, moves
 from tools.faults.rows import Judge, Row
 
 PHASE_S = 0.1
@@ -18,6 +18,8 @@ HOLD_S = 0.4
 """A stop counts as lasting after this time with zero commands only."""
 WATCH_S = 2.0
 """Duration of the watch for rows that must change nothing."""
+FRESH_S = 1.0
+"""Duration of the watch for rows that judge the age of commands."""
 STAY_S = 0.5
 """Duration of the watch of a latched stop after the end of its fault."""
 RESUME_S = 15.0
@@ -39,10 +41,13 @@ class Sample:
     """Other failures."""
     hindered: list[str] = field(default_factory=list)
     """Reason why the robot did not drive although permitted; a busy machine can cause it, so it is repeated."""
+    ended: bool = False
+    """Whether a run that may end or go on has ended."""
 
 
 def injection(rig: Rig, row: Row, rng: random.Random, host: HostStall) -> Sample:
     """Make one injection. Raises StepError or FaultError if the rig does not work."""
+    rig.stand_in = row.by_bridge
     rig.ensure_moving()
     time.sleep(rng.uniform(0.0, PHASE_S))
     before_ns = time.monotonic_ns()
@@ -51,6 +56,8 @@ def injection(rig: Rig, row: Row, rng: random.Random, host: HostStall) -> Sample
     effect_ns = row.inject(rig)
     if row.judged_by is Judge.UNCHANGED:
         sample = _unchanged(rig, effect_ns, host)
+    elif row.judged_by is Judge.FRESH:
+        sample = _fresh(rig, effect_ns, host)
     else:
         sample = _awaited(rig, row, effect_ns, commanders, host)
     _aftermath(rig, row, sample, commanders)
@@ -103,6 +110,14 @@ def _unchanged(rig: Rig, effect_ns: int, host: HostStall) -> Sample:
     return sample
 
 
+def _fresh(rig: Rig, effect_ns: int, host: HostStall) -> Sample:
+    """Measure the longest age of the newest received command while the robot obeys it."""
+    time.sleep(max(0.0, FRESH_S - (time.monotonic_ns() - effect_ns) / 1e9))
+    end_ns = effect_ns + round(FRESH_S * 1e9)
+    age_ms = longest_age_ms(rig.accepted_ns(), rig.robot_obeys_motion(), effect_ns, end_ns)
+    return Sample(age_ms, host.between_ns(effect_ns, end_ns) / 1e6)
+
+
 def _aftermath(rig: Rig, row: Row, sample: Sample, commanders: frozenset[int]) -> None:
     """End the fault and check the robot's behaviour afterwards."""
     if row.thaw:
@@ -110,7 +125,15 @@ def _aftermath(rig: Rig, row: Row, sample: Sample, commanders: frozenset[int]) -
         _stays(rig, sample, commanders, "moved after SIGCONT")
     if row.undo is not None:
         row.undo(rig)
-    if row.latches:
+    if row.judged_by is Judge.FRESH:
+        if not rig.drives_on(RESUME_S):
+            sample.ended = True
+            rig.kill_runner()
+            rig.clear()
+    elif row.starts_anew:
+        rig.kill_runner()
+        rig.clear()
+    elif row.latches:
         if row.judged_by is not Judge.UNCHANGED and not row.thaw:
             _stays(rig, sample, commanders, "moved although the stop latches")
         rig.kill_runner()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,7 @@ _WHAT = {
     Judge.LIMIT: "limit",
     Judge.ROBOT: "robot stands",
     Judge.UNCHANGED: "unchanged",
+    Judge.FRESH: "command's age",
 }
 
 
@@ -33,11 +36,18 @@ class RowResult:
     row: Row
     samples: Sequence[Sample]
     repeated: int = 0
+    load: float = 0.0
+    """Load average of the machine over the last minute, at the end of the row."""
 
     @property
     def latencies_ms(self) -> list[float]:
         """Measured latencies, ms."""
         return [sample.latency_ms for sample in self.samples if sample.latency_ms is not None]
+
+    @property
+    def ended(self) -> int:
+        """Number of runs that ended although they might have gone on."""
+        return sum(sample.ended for sample in self.samples)
 
     @property
     def granted(self) -> int:
@@ -74,10 +84,61 @@ class RowResult:
             "bound_ms": self.row.bound_ms,
             "granted": self.granted,
             "repeated": self.repeated,
+            "ended": self.ended,
+            "load": self.load,
             "problems": self.problems,
             "pass": not self.problems,
             "samples": [asdict(sample) for sample in self.samples],
         }
+
+
+def read_results(path: Path, rows: Sequence[Row]) -> list[RowResult]:
+    """Read the results of an earlier call; none without the file. Raises ValueError if it cannot be used."""
+    if not path.exists():
+        return []
+    by_name = {row.name: row for row in rows}
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))["rows"]
+        return [
+            RowResult(by_name[name], [Sample(**sample) for sample in one["samples"]], one["repeated"], one["load"])
+            for name, one in found.items()
+            if name in by_name
+        ]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(
+            f"{path}: expected a result of this command ({error!r}); delete it or leave out --resume"
+        ) from error
+
+
+def markdown(results: Sequence[Mapping[str, Any]]) -> str:
+    """Return the table of robots and faults: for each robot bound, p50, max and n of a row, ms.
+
+    `results`: contents of `faults.json`, one for each robot.
+    """
+    names = list(dict.fromkeys(name for one in results for name in one["rows"]))
+    lines = ["| fault | judged | " + " | ".join(str(one["robot"]) for one in results) + " |"]
+    lines.append("|---|---|" + "---|" * len(results))
+    for name in names:
+        found = [one["rows"].get(name) for one in results]
+        judged = next(_WHAT[Judge(row["judged_by"])] for row in found if row)
+        lines.append(f"| {name} | {judged} | " + " | ".join(map(_cell, found)) + " |")
+    loads = [f"{one['robot']} {low:.1f} to {high:.1f}" for one in results for low, high in [_loads(one)]]
+    return "\n".join([*lines, "", f"Load of the machine (1 min): {', '.join(loads)}.", ""])
+
+
+def _cell(row: Mapping[str, Any] | None) -> str:
+    if row is None:
+        return "–"
+    if row["p50_ms"] is None:
+        return f"none of {row['n']}"
+    ended = f", {row['ended']} ended" if row["ended"] else ""
+    failed = "" if row["pass"] else " **failed**"
+    return f"≤ {row['bound_ms']:.0f}: {row['p50_ms']:.0f} / {row['max_ms']:.0f}, n {row['n']}{ended}{failed}"
+
+
+def _loads(one: Mapping[str, Any]) -> tuple[float, float]:
+    loads = [row["load"] for row in one["rows"].values()]
+    return min(loads), max(loads)
 
 
 def percentile(values: Sequence[float], share: float) -> float:
@@ -85,15 +146,20 @@ def percentile(values: Sequence[float], share: float) -> float:
     return float(np.percentile(np.array(values), share, method="higher"))
 
 
-def result(rows: Sequence[RowResult], machine: Mapping[str, object]) -> dict[str, Any]:
+def result(rows: Sequence[RowResult], machine: Mapping[str, object], robot: str) -> dict[str, Any]:
     """Return the JSON result."""
     return {
+        "robot": robot,
         "injections": sum(len(row.samples) for row in rows),
         "pass": bool(rows) and all(not row.problems for row in rows),
         "tagged": "measured",
         "machine": dict(machine),
         "rows": {row.row.name: row.as_json() for row in rows},
     }
+
+
+def _counted(row: RowResult) -> tuple[tuple[int, str], ...]:
+    return (row.granted, "granted"), (row.repeated, "repeated"), (row.ended, "ended")
 
 
 def show(rows: Sequence[RowResult], console: Console) -> None:
@@ -108,7 +174,7 @@ def show(rows: Sequence[RowResult], console: Console) -> None:
     for row in rows:
         values = row.latencies_ms
         figures = [f"{percentile(values, share):.0f}" for share in (50, 99.9, 100)] if values else ["–"] * 3
-        counted = [f"{n} {what}" for n, what in ((row.granted, "granted"), (row.repeated, "repeated")) if n]
+        counted = [f"{n} {what}" for n, what in _counted(row) if n]
         verdict = "; ".join(row.problems) or ", ".join(["pass", *counted])
         what, count = _WHAT[row.row.judged_by], str(len(row.samples))
         bound = f"{row.row.bound_ms:.0f}"

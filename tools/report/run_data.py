@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.flightlog.reader import RecordingError, jpeg_bytes, read_messages
+from firmware_bridge.system.input_file import read_json
 
 Record = dict[str, Any]
 Array = NDArray[np.float64]
@@ -62,6 +63,8 @@ class Trace:
     """[n, 3] forward and leftward speed in the body frame (m/s) and yaw rate (rad/s)."""
     people: list[Array]
     """One [people, 3] array of x, y (m), heading (rad) per record."""
+    people_ns: NDArray[np.int64]
+    """[n] stamps of those records."""
     wire: list[Record]
     end: Record
 
@@ -85,7 +88,7 @@ class RunData:
 def load_json(path: Path) -> Record:
     """Read a JSON object from a file. Raises ReportError that names the file."""
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
+        value = read_json(path)
     except FileNotFoundError:
         raise ReportError(f"{path} is missing; expected the JSON result of the run") from None
     except (OSError, ValueError) as error:
@@ -174,6 +177,7 @@ def _trace(by_kind: dict[str, list[Record]]) -> Trace:
         pose_ns=np.array([p["t_ns"] for p in poses], np.int64),
         pose=np.column_stack([[float(p["x"]) for p in poses], [float(p["y"]) for p in poses], theta]),
         velocity=_body_velocity(poses, theta),
+        people_ns=np.array([p["t_ns"] for p in by_kind["people"]], np.int64),
         people=[np.asarray(p["poses"], float).reshape(-1, 3) for p in by_kind["people"]],
         wire=by_kind["wire"],
         end=by_kind["end"][-1] if by_kind["end"] else {},

@@ -13,7 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rich.console import Console
 
@@ -45,6 +45,10 @@ from edge.inference.graph import GraphError
 from edge.power.governor.plan import PowerPlan, read_power_plan
 from edge.power.meters.select import open_meter
 from firmware_bridge.core.config import ConfigError, RobotConfig, load_robot_config
+from firmware_bridge.system.terminal import CommandParser
+
+if TYPE_CHECKING:
+    from edge.inference.policy import Policy  # needs ONNX Runtime
 
 EXAMPLES = """examples:
   edge-doctor --artifacts out/orin --robot go2.toml
@@ -67,7 +71,7 @@ T = TypeVar("T")
 
 def parser() -> argparse.ArgumentParser:
     """Command line of `edge-doctor`."""
-    p = argparse.ArgumentParser(
+    p = CommandParser(
         "edge-doctor", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     p.add_argument("--artifacts", type=Path, metavar="DIR", help="directory made by edge-export")
@@ -181,6 +185,8 @@ def _machine(
     else:
         yield doctor_machine.match(facts, wanted, platform.machine(), available_providers(), root)
         yield doctor_machine.power_mode(facts.power_mode, root, _nvpmodel)
+        yield doctor_machine.boot_power_mode(facts.power_mode, root)
+    yield doctor_machine.hardware_watchdog(root)
     yield doctor_machine.clocks(root)
     yield doctor_machine.cpu_governor(root)
     yield doctor_machine.memory(plan, root, own_memory=facts is not None and facts.own_memory)
@@ -235,8 +241,8 @@ def _rights(
 
 def _graphs(args: argparse.Namespace, artifacts: Artifacts | None, plan: PlanFacts | None) -> Iterator[Check]:
     if artifacts is None:
-        yield skipped("providers of the graphs", "no artifacts")
-        yield skipped("tick", "no artifacts")
+        for name in ("self-test", "providers of the graphs", "tick"):
+            yield skipped(name, "no artifacts")
         return
     if engines.needed(artifacts):
         folder = (args.engines or engines.default_directory(artifacts.directory)).absolute()
@@ -245,13 +251,20 @@ def _graphs(args: argparse.Namespace, artifacts: Artifacts | None, plan: PlanFac
         except engines.EngineError as error:
             problem, _, advice = str(error).rpartition("; build it first: ")
             yield Check("engines", Level.FAIL, problem or advice, "this device's own", advice)
-            yield skipped("providers of the graphs", "an engine would be built now, for minutes")
-            yield skipped("tick", "the engines are missing")
+            for name in ("self-test", "providers of the graphs", "tick"):
+                yield skipped(name, "an engine would be built now, for minutes")
             return
         yield Check("engines", Level.OK, f"{folder}: this device's own")
         artifacts = engines.with_engines(artifacts, folder)
     from edge.deploy.doctor import graphs as doctor_graphs  # needs ONNX Runtime
 
+    # First: profiling has no limits of time and memory.
+    tested, policy = doctor_graphs.self_test(artifacts)
+    yield tested
+    if policy is None:
+        for name in ("providers of the graphs", "tick"):
+            yield skipped(name, "the self-test failed")
+        return
     placed = [doctor_graphs.profile_graph(artifacts, name) for name in artifacts.graphs]
     yield from placed
     if failed(placed):
@@ -259,20 +272,19 @@ def _graphs(args: argparse.Namespace, artifacts: Artifacts | None, plan: PlanFac
     elif args.ticks == 0:
         yield skipped("tick", "--ticks 0")
     else:
-        yield _tick(args, artifacts, plan)
+        yield _tick(args, policy, plan)
 
 
-def _tick(args: argparse.Namespace, artifacts: Artifacts, plan: PlanFacts | None) -> Check:
+def _tick(args: argparse.Namespace, policy: Policy, plan: PlanFacts | None) -> Check:
     from edge.deploy.doctor import graphs as doctor_graphs  # needs ONNX Runtime
 
-    prompt = artifacts.runtime.frame_tokens if plan is None else plan.prompt_tokens
+    runtime = policy.artifacts.runtime
+    prompt = runtime.frame_tokens if plan is None else plan.prompt_tokens
     try:
-        times_ms = doctor_graphs.measure_ticks(
-            artifacts, args.ticks, TICK_BUDGET_S, min(prompt, artifacts.runtime.max_context)
-        )
-    except (ArtifactError, GraphError) as error:
+        times_ms = doctor_graphs.measure_ticks(policy, args.ticks, TICK_BUDGET_S, min(prompt, runtime.max_context))
+    except GraphError as error:
         return Check("tick", Level.FAIL, str(error), "a tick that runs", "edge-export verify DIR names what is wrong")
-    return doctor_graphs.judge_ticks(times_ms, plan, artifacts.runtime.tick_period_ms)
+    return doctor_graphs.judge_ticks(times_ms, plan, runtime.tick_period_ms)
 
 
 if __name__ == "__main__":

@@ -13,12 +13,14 @@ from typing import Any, Final
 import numpy as np
 import onnxruntime as ort
 
+from edge.artifacts.files import ArtifactError
 from edge.artifacts.manifest import Artifacts, GraphContract
 from edge.artifacts.target_facts import PlanFacts
 from edge.core.geometry import SE2
 from edge.deploy.doctor.check import Check, Level, skipped
 from edge.inference.graph import CPU_PROVIDER, Array, zeros
 from edge.inference.policy import Policy
+from edge.inference.warm_up import open_proven
 from edge.state.semantic import STRAIGHT_AHEAD, SemanticState
 
 SHAPE_OPERATORS: Final = frozenset(
@@ -125,12 +127,24 @@ def example_feeds(artifacts: Artifacts, contract: GraphContract) -> dict[str, Ar
     return feeds
 
 
-def measure_ticks(artifacts: Artifacts, count: int, budget_s: float, prompt_tokens: int) -> list[float]:
+def self_test(artifacts: Artifacts) -> tuple[Check, Policy | None]:
+    """Run the runner's self-test; return its check and the opened policy, None after a failure."""
+    name, known = "self-test", artifacts.known_answers
+    expected = "the exporter's answers" if known is None else f"the exporter's answers within {known.limit_s:g} s"
+    try:
+        opened = open_proven(artifacts)
+    except ArtifactError as error:
+        problem, _, advice = str(error).rpartition("; ")
+        return Check(name, Level.FAIL, problem or advice, expected, advice), None
+    return Check(name, Level.OK, str(opened.tested), expected), opened.policy
+
+
+def measure_ticks(policy: Policy, count: int, budget_s: float, prompt_tokens: int) -> list[float]:
     """Measure ticks on a black frame (encode and act), ms; fewer than `count` when the time budget is used up.
 
-    Raises ArtifactError or GraphError.
+    Raises GraphError.
     """
-    policy, runtime = Policy(artifacts), artifacts.runtime
+    runtime = policy.artifacts.runtime
     here = SE2(0.0, 0.0, 0.0)
     frame = np.zeros((1, runtime.image_px, runtime.image_px, 3), dtype=np.uint8)
     kv = np.zeros((1, prompt_tokens, runtime.kv_dim), dtype=np.float32)

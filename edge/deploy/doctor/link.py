@@ -15,7 +15,8 @@ from edge.deploy.doctor.rights import UserRights
 from edge.deploy.link_rights import SERIAL_GROUP, serial_device
 from edge.deploy.unit_check import run_command
 from edge.deploy.units import FIREWALL_FILE, FIREWALL_FOLDER, FIREWALL_UNIT
-from firmware_bridge.core.config import RobotConfig
+from firmware_bridge.backends import INSTALL
+from firmware_bridge.core.config import ConfigError, RobotConfig
 
 Runner = Callable[[Sequence[str]], tuple[int, str]]
 
@@ -36,6 +37,8 @@ def robot_links(robot: RobotConfig, root: Path, user: UserRights, run: Runner = 
         yield can_interface(robot.can.channel, robot.can.bitrate_bps, root, run)
     elif robot.can is not None:
         yield skipped("CAN interface", f"{robot.can.interface} is a simulated bus")
+    if robot.can is not None:
+        yield dbc_file(robot)
     if robot.mavlink is not None:
         host = "" if device is not None else robot.mavlink.link.split(":")[1]
         yield signing_key(robot.mavlink.signing_key, host, root)
@@ -113,6 +116,22 @@ def can_interface(channel: str, bitrate_bps: int, root: Path, run: Runner = run_
         advice = f"after a bus-off it stays off: {again}"
         return Check(name, Level.WARN, found, expected, advice)
     return Check(name, Level.OK, found, expected)
+
+
+def dbc_file(robot: RobotConfig) -> Check:
+    """Whether the robot file and the DBC file of a CAN base fit each other, and the load that they plan."""
+    name, expected = "DBC file", "what the tables of [can] name"
+    try:
+        from firmware_bridge.can.database import load_database  # needs the extra of its protocol
+
+        database = load_database(robot)
+    except ModuleNotFoundError as error:
+        return skipped(name, f"{error.name} is missing: {INSTALL['can']}")
+    except ConfigError as error:
+        return Check(name, Level.FAIL, str(error), expected, "correct the key that the message names, or the DBC file")
+    path = robot.can.dbc_path if robot.can is not None else ""
+    counts = f"{len(database.received)} messages received, {len(database.sent)} sent"
+    return Check(name, Level.OK, f"{path}: {counts}, {database.load:.0%} of the bus", expected)
 
 
 def _can_details(channel: str, run: Runner) -> dict[str, Any] | None:

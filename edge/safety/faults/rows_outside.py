@@ -135,6 +135,12 @@ BRIDGE: tuple[Fault, ...] = (
         "test_a_publisher_of_motor_commands_stops_a_driven_robot",
     ),
     Fault(
+        "mavlink-forged", 41, Action.NOTHING, 0, "bridge",
+        "Unsigned, forged or recorded MAVLink packets, or packets of another system, arrived and were dropped.",
+        "Find the sender: edge-bridge counts its packets as malformed; sign the link (mavlink.signing_key).",
+        "tests/firmware_bridge/mavlink/test_mavlink_session.py::TestSigning::test_forged_packets_change_nothing",
+    ),
+    Fault(
         "robot-mode-left", 42, Action.STOP, 1000, "bridge",
         "The robot left its driving modes by itself.",
         "Check the robot: it may have fallen or been taken over; then arm again.",
@@ -145,6 +151,25 @@ BRIDGE: tuple[Fault, ...] = (
         "The robot reports an error of its own.",
         "Find the error code in the maker's manual before arming again.",
         "tests/firmware_bridge/test_bridge_dangers.py::TestEveryDanger::test_it_stops_a_driven_robot_in_the_same_step",
+    ),
+    Fault(
+        "can-bus-off", 43, Action.STOP, 100, "bridge",
+        "The CAN controller is bus-off or error-passive: its error frames say so.",
+        "Check wiring, termination and bit rate, then arm again.",
+        "tests/firmware_bridge/can/test_can_supervision.py::"
+        "test_an_error_frame_of_a_controller_in_trouble_stops_it_in_the_next_step",
+    ),
+    Fault(
+        "can-frames-invalid", 44, Action.STOP, 160, "bridge",
+        "Five frames of a CAN message in a row had a wrong CRC, counter or length.",
+        "Check wiring and DBC file: edge-bridge status names the message; then arm again.",
+        "tests/firmware_bridge/can/test_can_supervision.py::test_five_wrong_crcs_in_a_row_stop_the_robot_within_100_ms",
+    ),
+    Fault(
+        "can-bus-overloaded", 45, Action.NOTHING, 0, "bridge",
+        "The load of the CAN bus is above 80 %: commands may be late, and a base without commands stops by itself.",
+        "Find the node that sends: the bridge's log names the most frequent unknown identifier.",
+        "tests/firmware_bridge/can/test_can_supervision.py::test_a_babbling_node_is_named_to_the_operator",
     ),
     Fault(
         "robot-link-down", 46, Action.STOP, 100, "bridge",

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import sin
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge.core.geometry import SE2
 from sim_hil.robots.odometry_noise import LEVELS, OdometryNoise
+
+CAMERA_ASPECT: Final = 16 / 9
+"""Width by height of the rendered view, before it is scaled to the policy's input size."""
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from edge.core.geometry import SE2
 from sim_hil.benchmark.env.metrics import FRAME_HZ, Outcome, is_success, measure
-from sim_hil.benchmark.env.observation import Observation, Odometer
+from sim_hil.benchmark.env.observation import CAMERA_ASPECT, Observation, Odometer
 from sim_hil.benchmark.suite.episode import Episode
 from sim_hil.robots.interface import Robot
 from sim_hil.robots.odometry_noise import LEVELS
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 FRAMES_PER_STEP: Final = 3  # control at 10 Hz; the action is constant in between (paper appendix D)
-CAMERA_ASPECT: Final = 16 / 9  # aspect ratio of the rendered view before it is scaled to the policy's input size
 MAX_PIXELS: Final = 2048
 
 

@@ -7,15 +7,18 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
 from edge.artifacts.files import ArtifactError
 from edge.artifacts.manifest import Artifacts, load_artifacts
 from edge.core.geometry import SE2
+from edge.flightlog.recorder import RecordSink
 from edge.inference.generation_task import GenerationModels
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy as Model
@@ -29,19 +32,22 @@ from edge.state.frame import Frame, fit_frame
 from edge.state.pose_history import PoseHistory, StampedPose
 from edge.state.ring import TokenRing
 from edge.state.semantic import SemanticSlot, SemanticState, SharedState
-from edge.state.switches import Switches, SwitchOptions
+from edge.state.switches import Speculation, Switches, SwitchOptions
 from firmware_bridge.client import BridgeStatus
 from firmware_bridge.core.config import RobotConfig
 from sim_hil.benchmark.conditions.conditions import ConditionsError
 from sim_hil.benchmark.conditions.latency import LatencyProfile, LatencySampler
-from sim_hil.benchmark.env.observation import Observation
+from sim_hil.benchmark.env.observation import CAMERA_ASPECT, Observation
 from sim_hil.benchmark.policies.virtual_time_reasoner import VirtualTimeReasoner
 from sim_hil.benchmark.suite.episode import Episode
+from sim_hil.benchmark.suite.robots import camera_mount
 
 CONTROL_PERIOD_NS = 100_000_000
 RING_S = 16.0
 """Length of the frame history, s: the 9 s that a generation looks back, plus the wait for a late anchor."""
-_START_NS = 1_000_000_000
+_LOG_QUALITY = 75
+"""JPEG quality of the pictures in a log."""
+START_NS = 1_000_000_000
 """The loop's clock at an episode's start, ns; not zero, because a stamp of zero means "no stamp"."""
 
 
@@ -63,10 +69,14 @@ class ArtifactsPolicy:
         check_suits(self._artifacts, mode)
         self._mode, self._latency, self._robot = Mode(mode), latency, robot
         runtime, asked = self._artifacts.runtime, switches or SwitchOptions()
-        self._switches = asked.over(runtime.decoding, runtime.recovery, stand_at_goal=False)
+        self._switches = asked.over(runtime.switches, stand_at_goal=False)
         self._model = Model(self._artifacts, threads=1)
-        self._language = LanguageModel(self._artifacts, threads=1)
+        self.language = LanguageModel(self._artifacts, threads=1)
+        if self._switches.speculation is Speculation.ON:
+            self.language.speculate()
         self._drive: _Drive | None = None
+        self.recorder: RecordSink | None = None
+        """Takes the records of the next episode and its pictures."""
         self.name = f"artifacts:{self._artifacts.model_name}"
 
     @property
@@ -81,11 +91,32 @@ class ArtifactsPolicy:
 
     def reset(self, episode: Episode, instruction: str, world: object | None, seed: int) -> None:
         """Begin an episode without frames and semantic state. Raises InstructionError if the prompt is too long."""
-        self._language.check_instruction(instruction)
+        self.language.check_instruction(instruction)
         draw = LatencySampler(self._latency, seed, episode.id).draw
         self._drive = _Drive(
-            self._artifacts, self._model, self._language, self._robot, self._mode, instruction, draw, self._switches
-        )
+            self._artifacts, self._model, self.language, self._robot, self._mode, instruction, draw, self._switches,
+            self.recorder,
+        )  # fmt: skip
+        if self.recorder is not None:
+            self.recorder.put("/run", START_NS, self._run_record(instruction, episode.robot))
+
+    def _run_record(self, instruction: str, robot: str) -> dict[str, Any]:
+        own = None if self._robot.mount is None else asdict(self._robot.mount)
+        mount = camera_mount(robot) or own
+        return {
+            "instruction": instruction,
+            "mode": self._mode.value,
+            **self._switches.as_json(),
+            "artifacts": str(self._artifacts.directory),
+            "manifest_sha256": self._artifacts.manifest_sha256,
+            "robot": robot,
+            "release": self._artifacts.release,
+            "limits": asdict(self._robot.limits),
+            "mount": None if mount is None else {**mount, "aspect": CAMERA_ASPECT},
+            "release_delay": {},
+            "started_ns": START_NS,
+            "tick_period_ms": CONTROL_PERIOD_NS // 1_000_000,
+        }
 
     def act(self, observation: Observation) -> tuple[float, float, float]:
         """Return the command of one control period. Raises ValueError without an image or before `reset`."""
@@ -111,7 +142,7 @@ class _Drive:
 
     def __init__(
         self, artifacts: Artifacts, model: Model, language: LanguageModel, robot: RobotConfig, mode: Mode,
-        instruction: str, draw: Any, switches: Switches,
+        instruction: str, draw: Any, switches: Switches, recorder: RecordSink | None,
     ) -> None:  # fmt: skip
         runtime = artifacts.runtime
         if runtime.tick_period_ms * 1_000_000 != CONTROL_PERIOD_NS:
@@ -132,6 +163,7 @@ class _Drive:
             ReasoningConfig(runtime.frame_offsets_s, runtime.max_new_tokens, mode, switches.decoding),
             instruction,
             draw,
+            recorder,
         )
         config = ControllerConfig(
             robot.limits, runtime.step_s, FRAME_MAX_AGE_MS, odometry_max_age_ms=float(robot.odometry.max_age_ms)
@@ -149,15 +181,17 @@ class _Drive:
             ControlSources(lambda: self._frame, self._history),
             shared,
             CommandChain(Controller(config), Watch(watch, sources), Supervisor()),
-            ControlOutputs(_NoBridge()),
+            ControlOutputs(_NoBridge(), recorder),
             stop=threading.Event(),
             clock=lambda: self._now_ns,
         )
+        self._records = recorder is not None
         self.notes: dict[str, Any] = {}
 
     def tick(self, observation: Observation, image: npt.NDArray[np.uint8]) -> tuple[float, float, float]:
-        now_ns = self._now_ns = _START_NS + round(observation.time_s * 1e9)
-        self._frame = Frame(now_ns, fit_frame(image, self._image_px), b"")
+        now_ns = self._now_ns = START_NS + round(observation.time_s * 1e9)
+        jpeg = _jpeg(image) if self._records else b""
+        self._frame = Frame(now_ns, fit_frame(image, self._image_px), jpeg)
         self._history.put(StampedPose(now_ns, observation.T_odom_base, *observation.state))
         self._reasoner.release(now_ns)
         self._recording.last = None
@@ -188,7 +222,7 @@ class _Drive:
     def generations(self) -> list[Mapping[str, Any]]:
         keys = ("started_s", "anchor_s", "released_s")
         return [
-            {**record, **{key: round(record[key] - _START_NS / 1e9, 3) for key in keys}}
+            {**record, **{key: round(record[key] - START_NS / 1e9, 3) for key in keys}}
             for record in self._reasoner.released
         ]
 
@@ -230,6 +264,12 @@ class _NoBridge:
     def poll(self) -> BridgeStatus | None:
         """Return None: there is no bridge status."""
         return None
+
+
+def _jpeg(image: npt.NDArray[np.uint8]) -> bytes:
+    """Return a picture, uint8 RGB [height, width, 3], as JPEG for a log; the policy sees the uncompressed one."""
+    picture = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    return bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _LOG_QUALITY])[1].tobytes())
 
 
 def check_suits(artifacts: Artifacts, mode: str) -> None:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from edge.flightlog.recorder import RecordSink
 from edge.inference.generation_task import GENERATION_ERRORS, GenerationModels, GenerationResult, GenerationTask
 from edge.reasoning.anchor import Anchor, older_frames
 from edge.reasoning.generation_cycle import (
@@ -55,8 +56,10 @@ class VirtualTimeReasoner:
         config: ReasoningConfig,
         instruction: str,
         draw: Callable[[], Timing],
+        recorder: RecordSink | None = None,
     ) -> None:
-        """`draw` returns the latency of the next generation."""
+        """`draw` returns the latency of the next generation; `recorder` takes the published ones."""
+        self._recorder = recorder
         self._models = models
         self._ring, self._slot = shared.ring, shared.slot
         self._offsets_s = config.older_offsets_s
@@ -127,6 +130,10 @@ class VirtualTimeReasoner:
         if used:
             self._slot.state = task.publish(result, number=number, ready_ns=now_ns, text_complete=outputs.text_complete)
             self._slot.drive_until_ns = outputs.drive_until_ns
+            if self._recorder is not None:
+                times = {"started_ns": under_way.started_ns, "finished_ns": now_ns, "release_delay_s": 0.0}
+                record = {**times, **task.state_record(result, self._slot.state), "context_ms": 0.0}
+                self._recorder.put("/semantic", now_ns, record)
         self.released.append(
             {
                 "generation": number,

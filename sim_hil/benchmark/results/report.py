@@ -14,6 +14,7 @@ from edge.core.cli import write_whole
 from reporting.page import Cell, Figure, Table, mark, render
 from reporting.plot_style import BAD, GOOD, INK, MUTED, TRUTH, delay_histogram, legend_above, new_figure, png, tidy
 from sim_hil.benchmark.conditions.conditions import Conditions
+from sim_hil.benchmark.results.failures import cause_table, failure_sheet, failures
 from sim_hil.benchmark.results.record import EpisodeResult, read_log
 from sim_hil.benchmark.results.store import EPISODES, VIDEOS, ResultStore
 from sim_hil.benchmark.results.summary import GROUPS, METRICS, grouped_by, interval_of
@@ -83,10 +84,23 @@ def _results(
         "delays": Figure(delay_histogram(delays), "Histogram of the delay", caption) if len(delays) else None,
         "maps": _maps(results, logs),
         "endings": _endings(store.directory, results),
+        **_failures(store.directory, results),
         "texts": _texts(results, logs),
         "episodes": _episode_table(store.directory, results),
         "facts": Table(("what", "value"), [(key, str(value)) for key, value in _facts(store.config, conditions)]),
     }  # fmt: skip
+
+
+def _failures(directory: Path, results: Sequence[EpisodeResult]) -> dict[str, object]:
+    """Return the values of the part of the page about failures; empty without kept flight logs."""
+    found = failures(directory, results)
+    failed = sum(not result.success or result.collided for result in results)
+    return {
+        "explained": f"{len(found)} of {failed} failed episodes",
+        "causes": cause_table(found) if found else None,
+        "failure_sheet": failure_sheet(found),
+        "failure_cards": [failure.card for failure in found],
+    }
 
 
 def _hits(result: EpisodeResult) -> str:

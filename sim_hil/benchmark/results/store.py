@@ -3,7 +3,7 @@
 config.json     conditions, episodes, versions: written first, never changed; a resumed run must have the same
 results.jsonl   one line per finished episode, appended whole
 failed.jsonl    episodes whose process died in every attempt; a resumed run tries them again
-episodes/ID.json, videos/ID.mp4    written before their line in results.jsonl
+episodes/ID.json, videos/ID.mp4, flights/ID.mcap    written before their line in results.jsonl
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ from pathlib import Path
 from typing import IO, Any
 
 from edge.core.cli import write_whole
+from firmware_bridge.system.input_file import read_json
 from sim_hil.benchmark.results.record import EpisodeResult, FailedRun, ResultError
 
 CONFIG, RESULTS, FAILED = "config.json", "results.jsonl", "failed.jsonl"
-EPISODES, VIDEOS = "episodes", "videos"
+EPISODES, VIDEOS, FLIGHTS = "episodes", "videos", "flights"
 
 
 class StoreError(ValueError):
@@ -114,7 +115,7 @@ def read_config(directory: Path) -> dict[str, Any]:
     """Read the configuration of a run. Raises StoreError."""
     path = directory / CONFIG
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
     except (OSError, ValueError) as error:
         raise StoreError(f"{path}: expected the configuration of a benchmark run ({error})") from error
     if not isinstance(content, dict):

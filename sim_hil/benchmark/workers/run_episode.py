@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 
 from sim_hil.benchmark.conditions.conditions import ConditionsError
 from sim_hil.benchmark.env.world import EpisodeWorld, WorldOptions
+from sim_hil.benchmark.policies.artifacts_policy import START_NS, ArtifactsPolicy
 from sim_hil.benchmark.policies.select import camera_for, open_policy
+from sim_hil.benchmark.results.flight import EpisodeFlight
 from sim_hil.benchmark.results.record import EpisodeLog, EpisodeResult
 from sim_hil.benchmark.workers.task import EpisodeTask, episode_result
 
@@ -33,10 +35,15 @@ def run_lockstep(task: EpisodeTask, on_time: OnTime) -> EpisodeResult:
         video = None if task.video == "none" else _video(task)
         if video is not None:
             cleanup.callback(video.discard)
+        flight = None
+        if task.flights != "none" and isinstance(policy, ArtifactsPolicy):
+            policy.recorder = flight = EpisodeFlight(task.flight_path)
         policy.reset(episode, task.instruction, world if policy.privileged else None, episode.seed)
         while not world.done:
             observation = world.observe()
             command = policy.act(observation)
+            if flight is not None:
+                flight.see(world, START_NS + round(observation.time_s * 1e9))
             notes = policy.notes()
             delay_s = notes.get("delay_s")
             log.add(
@@ -55,6 +62,8 @@ def run_lockstep(task: EpisodeTask, on_time: OnTime) -> EpisodeResult:
         log.write(task.log_path, generations or [], world.people(), episode.goal_xy)
         if video is not None and (task.video == "all" or not outcome.success or outcome.collided):
             video.keep()
+        if flight is not None and (task.flights == "all" or not outcome.success or outcome.collided):
+            flight.keep(world, outcome)
         count = None if generations is None else len(generations)
         return episode_result(
             task, outcome, log, generations=count, stopped_by=str(notes.get("stopped_by", "")), started_ns=started_ns

@@ -12,7 +12,7 @@ from typing import Any
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.env.metrics import Outcome
 from sim_hil.benchmark.results.record import EpisodeLog, EpisodeResult
-from sim_hil.benchmark.results.store import EPISODES, VIDEOS
+from sim_hil.benchmark.results.store import EPISODES, FLIGHTS, VIDEOS
 from sim_hil.benchmark.suite.episode import Episode, SuiteError
 
 VIDEO_CHOICES = ("all", "failed", "none")
@@ -26,12 +26,14 @@ class EpisodeTask:
     conditions: Conditions
     folder: Path
     video: str = "none"
+    flights: str = "none"
     manifest_sha256: str = ""
     attempt: int = 1
 
     def __post_init__(self) -> None:
-        if self.video not in VIDEO_CHOICES:
-            raise ConditionsError(f"video {self.video!r}: expected one of {', '.join(VIDEO_CHOICES)}")
+        for name, choice in (("video", self.video), ("flights", self.flights)):
+            if choice not in VIDEO_CHOICES:
+                raise ConditionsError(f"{name} {choice!r}: expected one of {', '.join(VIDEO_CHOICES)}")
         wordings = len(self.episode.instructions)
         if self.conditions.wording >= wordings:
             raise ConditionsError(
@@ -53,9 +55,14 @@ class EpisodeTask:
         """Path of the episode's video."""
         return self.folder / VIDEOS / f"{self.episode.id}.mp4"
 
+    @property
+    def flight_path(self) -> Path:
+        """Path of the episode's flight log."""
+        return self.folder / FLIGHTS / f"{self.episode.id}.mcap"
+
     def as_json(self) -> dict[str, Any]:
         """Return the task as JSON values, to be read by `of_json`."""
-        values = {key: getattr(self, key) for key in ("video", "manifest_sha256", "attempt")}
+        values = {key: getattr(self, key) for key in ("video", "flights", "manifest_sha256", "attempt")}
         conditions = self.conditions.as_json()
         return {**values, "episode": asdict(self.episode), "conditions": conditions, "folder": str(self.folder)}
 
@@ -64,7 +71,7 @@ class EpisodeTask:
         """Read a task written by `as_json`. Raises ConditionsError or SuiteError."""
         try:
             raw: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in content["episode"].items()}
-            rest = {key: content[key] for key in ("video", "manifest_sha256", "attempt")}
+            rest = {key: content[key] for key in ("video", "flights", "manifest_sha256", "attempt")}
             conditions = Conditions.of_json(content["conditions"])
             return EpisodeTask(Episode(**raw), conditions, Path(content["folder"]), **rest)
         except (KeyError, TypeError, AttributeError) as error:

@@ -15,7 +15,8 @@ from firmware_bridge.can.buses import BusError
 from firmware_bridge.can.frame import Frame
 
 _LISTEN_S: Final = 0.1
-_SEND_QUEUE: Final = 256
+_SEND_QUEUE: Final = 1024
+"""Frames that wait, 2 s of the Carter's: after a pause of the computer it sends them late instead of never."""
 _RECEIVE_QUEUE: Final = 4096
 _SEND_S: Final = 0.05
 _END_S: Final = 1.0

@@ -24,7 +24,7 @@ from sim_hil.protocols.can.buses import BusLink
 from sim_hil.protocols.can.frames import Received
 from sim_hil.protocols.can.node import CanNode
 from sim_hil.protocols.can.pty_line import PtyLine
-from sim_hil.protocols.can.shim import FaultPlan, FaultShim
+from sim_hil.protocols.can.shim import BABBLER_ID, FaultPlan, FaultShim
 from sim_hil.protocols.fault_socket import PlanFaults, parse_plan
 from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, ReceivedCommand
 from sim_hil.robots.carter.body import Carter
@@ -32,7 +32,7 @@ from sim_hil.robots.carter.sensors import CarterSensors, Sensors
 from sim_hil.simulation.physics import Simulation
 
 CAMERA_PORT: Final = 8090
-SWITCHES: Final = ("button", "bus_off")
+SWITCHES: Final = ("button", "bus_off", "deaf", "silent", "mute", "battery_empty")
 _EVENT_S: Final = 0.1
 _TRACED: Final = {"VelocityCommand": ("Vx", "Wz"), "ModeCommand": ("Request",), "EstopControl": ("Request",)}
 _STOPS: Final = (("EstopControl", frames.ESTOP_STOP), ("ModeCommand", frames.MODE_DISARM))
@@ -158,6 +158,10 @@ class CanFrontEnd(CameraFrontEnd):
         """Execute the received commands and return them. Raises BusError if the bus was lost."""
         assert self._link is not None
         for received_ns, frame in self._link.receive():
+            if frame.identifier in _OWN and not frame.error:
+                continue  # a bus between processes also returns what we sent
+            if self._is_on("deaf", "mute"):
+                continue
             if self._faulty:
                 self._inwards.put(frame, self._now_s)
             else:
@@ -215,6 +219,8 @@ class CanFrontEnd(CameraFrontEnd):
                 self._outwards.put(frame, stamp_s)
             # Each node detects the bus's error frames by itself.
             due = [frame for frame in self._outwards.take(stamp_s) if not frame.error]
+        if self._is_on("silent", "mute"):
+            return
         for frame in due:
             self._states += frame.identifier == _MOTION_ID
             self._link.send(frame)
@@ -224,8 +230,12 @@ class CanFrontEnd(CameraFrontEnd):
             return
         self._faults.poll()
         self._node.button = "button" in self._faults.active
+        self._sensors.is_empty = "battery_empty" in self._faults.active
         for shim in (self._inwards, self._outwards):
             shim.plan, shim.held_off = self._faults.plan, "bus_off" in self._faults.active
+
+    def _is_on(self, *switches: str) -> bool:
+        return self._faults is not None and not self._faults.active.isdisjoint(switches)
 
     @property
     def pending(self) -> int:
@@ -270,6 +280,7 @@ class CanFrontEnd(CameraFrontEnd):
 
 
 _MOTION_ID: Final = frames.database().get_message_by_name("OdometryMotion").frame_id
+_OWN: Final = frozenset({BABBLER_ID, *(message.frame_id for message in frames.sent_by("Base"))})
 
 
 def open_front_end(simulation: Simulation, options: FrontEndOptions) -> CanFrontEnd:

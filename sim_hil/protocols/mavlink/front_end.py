@@ -5,10 +5,11 @@
                                                                 ground stations; a station that answers gets all reports
   udp:127.0.0.1:14580,autopilot=ardupilot    announces ArduPilot Rover instead of PX4: GUIDED and HOLD, its parameters
   udp:127.0.0.1:14580,key=signing.hex    unsigned packets are ignored, all sent packets are signed
-  udp:127.0.0.1:14580,loss_percent=30,jitter_ms=200    a radio that loses and delays packets (`udp.Impairment`)
+  udp:127.0.0.1:14580,loss_percent=30,jitter_ms=200    a radio that loses and delays packets (`Impairment`)
 
 `--faults PATH` accepts the impairment's fields, "button" (emergency stop button pressed), "pilot" (a person switches
-the remote to MANUAL) and "mute" (nothing is received or sent).
+the remote to MANUAL), "deaf" (nothing is received), "silent" (nothing is sent), "mute" (both), "battery_empty", and the
+attacks of `forger.py`.
 """
 
 from __future__ import annotations
@@ -24,19 +25,21 @@ from sim_hil.protocols.base import CameraFrontEnd, CommandLog
 from sim_hil.protocols.camera_stream import CameraStream
 from sim_hil.protocols.fault_socket import PlanFaults, parse_plan, plan_fields
 from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, ReceivedCommand
+from sim_hil.protocols.impairment import PERFECT, Impairment
+from sim_hil.protocols.mavlink import forger
 from sim_hil.protocols.mavlink.autopilots import BY_NAME
 from sim_hil.protocols.mavlink.node import COMPONENT, Command, MavlinkNode
 from sim_hil.protocols.mavlink.parameters import Parameters
 from sim_hil.protocols.mavlink.setpoints import SetpointError, read_setpoint
-from sim_hil.protocols.mavlink.udp import PERFECT, Address, Impairment, UdpLink, parse_address
+from sim_hil.protocols.mavlink.udp import Address, UdpLink, parse_address
 from sim_hil.protocols.mavlink.vehicle import Station
-from sim_hil.protocols.mavlink.wire import Message, Reader, Verifier, Writer, now_ticks, read_key
+from sim_hil.protocols.mavlink.wire import TICKS_PER_S, Message, Reader, Verifier, Writer, now_ticks, read_key
 from sim_hil.robots.carter.body import Carter
 from sim_hil.robots.carter.sensors import CarterSensors, Sensors
 from sim_hil.simulation.physics import Simulation
 
 CAMERA_PORT: Final = 8090
-SWITCHES: Final = ("button", "mute", "pilot")
+SWITCHES: Final = ("button", "deaf", "silent", "mute", "pilot", "battery_empty", *forger.KINDS)
 DEFAULT_LINK: Final = "udp:127.0.0.1:14580,to=127.0.0.1:14540,to=127.0.0.1:14550"
 
 _NOT_TRACED: Final = ("mavpackettype", "target_system", "target_component", "time_boot_ms", "command", "confirmation")
@@ -108,9 +111,10 @@ class MavlinkFrontEnd(CameraFrontEnd):
 
     def __init__(self, robot: Carter, options: FrontEndOptions, link: LinkOptions, state_length: int) -> None:
         """Open port and camera. Raises FrontEndError or OSError."""
-        ticks = 0 if link.key is None else now_ticks()
+        self._ticks = ticks = 0 if link.key is None else now_ticks()
         self._reader = Reader(None if link.key is None else Verifier(link.key, ticks))
         self._writer = Writer(link.system, COMPONENT, link.key, ticks)
+        self._forger = forger.Forger(link.system, link.key, ticks)
         self._sensors = CarterSensors(robot, odometry_noise=options.odometry_noise, seed=options.seed)
         parameters = Parameters(link.autopilot, MAV_SYS_ID=link.system)
         autopilot = BY_NAME[link.autopilot]
@@ -149,7 +153,7 @@ class MavlinkFrontEnd(CameraFrontEnd):
         """Execute and answer the received commands and return them."""
         commands: list[ReceivedCommand] = []
         for data, address in self._link.receive(self._now_s):
-            if self._muted:
+            if self._is_on("deaf", "mute"):
                 continue
             received_ns = time.monotonic_ns()
             messages = self._reader.read(data)
@@ -201,10 +205,13 @@ class MavlinkFrontEnd(CameraFrontEnd):
     def publish(self, step: int, stamp_s: float) -> None:
         """Advance the rover's clock and send the messages that are due."""
         self._now_s = stamp_s
+        for sender in (self._writer, self._forger):
+            sender.advance(self._ticks + round(stamp_s * TICKS_PER_S))
         if self._faults is not None:
             self._faults.poll()
             self._node.vehicle.button = "button" in self._faults.active
             self._node.vehicle.pilot = "pilot" in self._faults.active
+            self._sensors.is_empty = "battery_empty" in self._faults.active
             self._link.impairment = self._faults.plan
         self._node.step(stamp_s)
         self._flush(self._node.due(stamp_s))
@@ -213,14 +220,16 @@ class MavlinkFrontEnd(CameraFrontEnd):
         for message in messages:
             number = message.get_msgId()
             self._states += number == common.MAVLINK_MSG_ID_ODOMETRY
-            if self._muted:
+            if self._is_on("silent", "mute"):
                 continue
             call = number == common.MAVLINK_MSG_ID_HEARTBEAT
-            self._link.send(self._writer.pack(message), self._now_s, call=call)
+            packet = self._writer.pack(message)
+            self._link.send(packet, self._now_s, call=call)
+            for forged in self._forger.packets(packet, () if self._faults is None else self._faults.active):
+                self._link.send(forged, self._now_s)
 
-    @property
-    def _muted(self) -> bool:
-        return self._faults is not None and "mute" in self._faults.active
+    def _is_on(self, *switches: str) -> bool:
+        return self._faults is not None and not self._faults.active.isdisjoint(switches)
 
     def _read(self) -> Sensors:
         return self._sensors.read(self._now_s)

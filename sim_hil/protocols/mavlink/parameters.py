@@ -43,7 +43,6 @@ TABLE: Final[Mapping[str, Parameter]] = MappingProxyType(
         "COM_OF_LOSS_T": Parameter(0.5, 0.1, 1.0),  # timeout of setpoints, s; the drive's own timeout is 1 s
         "MAV_GCS_SYSID": Parameter(0, 0, 255, integer=True),  # number of the only station that may drive; 0: any
         "MAV_SYS_ID": Parameter(1, 1, 255, integer=True),
-        "NAV_DLL_ACT": Parameter(1, 0, 1, integer=True),  # reaction to a missing station: 0 none, 1 hold
         "RO_MAN_SPEED": Parameter(0.6, 0.1, 1.5),  # m/s at full stick
         "RO_MAN_YAW_RATE": Parameter(60.0, 10.0, 115.0),  # degrees/s at full stick
         "RO_SPEED_LIM": Parameter(1.5, 0.1, 1.5),  # m/s
@@ -88,8 +87,6 @@ class Parameters:
     def __getitem__(self, name: str) -> float:
         if self._is_ardupilot and name == "COM_DL_LOSS_T":
             return self._values["FS_GCS_TIMEOUT"] if self._values["FS_GCS_ENABLE"] else inf
-        if name == "COM_DL_LOSS_T" and not self._values["NAV_DLL_ACT"]:
-            return inf
         return self._values[name]
 
     def set(self, message: Message) -> str | None:

@@ -109,7 +109,7 @@ class Vehicle:
         self.estop = False
         self.button = False
         self.pilot = False
-        """A person has switched the remote to MANUAL."""
+        """A person has switched the remote to MANUAL; when it ends, to HOLD."""
         self._had_pilot = False
         self.health = Health()
         self.controller: Station | None = None
@@ -286,6 +286,8 @@ class Vehicle:
             self._leave()
             self.mode = Mode.MANUAL
             self.send_text(_SEVERITY_NEWS, "Mode MANUAL by the remote")
+        if self._had_pilot and not self.pilot:
+            self._hold("Mode HOLD by the remote")
         self._had_pilot = self.pilot
         if self.armed and self.mode is Mode.OFFBOARD and not self._fresh(self._setpoint_s, now_s):
             self._lose_setpoints()

@@ -1,7 +1,7 @@
 """ROS 2 front end of `edge-hil`: the Carter as a base that follows a Twist on /cmd_vel and stops without one.
 
-`--faults PATH` accepts "button" (emergency stop button pressed), "odometry_off" (no odometry is sent) and "mute"
-(nothing is received or sent).
+`--faults PATH` accepts an impairment's fields, "button" (emergency stop button pressed), "odometry_off" (no odometry is
+sent), "deaf" (nothing is received), "silent" (nothing is sent), "mute" (both) and "battery_empty".
 """
 
 from __future__ import annotations
@@ -9,8 +9,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +17,10 @@ from numpy.typing import NDArray
 from firmware_bridge.core.config import DdsConfig
 from firmware_bridge.dds.bus import Bus, take_each
 from firmware_bridge.ros2.messages.common import Twist_
-from sim_hil.protocols.base import CameraFrontEnd, CommandLog
+from sim_hil.protocols.base import CameraFrontEnd, CommandLog, Vec3
 from sim_hil.protocols.fault_socket import PlanFaults
 from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions, ReceivedCommand
+from sim_hil.protocols.impairment import PERFECT, ImpairedDirection, Impairment
 from sim_hil.protocols.render_process import RenderProcess
 from sim_hil.protocols.ros2.topics import COMMAND_TOPIC, IMAGE_TOPIC, ODOMETRY_TOPIC, Reports
 from sim_hil.robots.carter.body import Carter
@@ -29,14 +29,9 @@ from sim_hil.simulation.physics import Simulation
 
 BASE_TIMEOUT_S: Final = 0.5
 """Time without a command after which the base stops by itself, s: the default of ros2_controllers' diff_drive."""
-SWITCHES: Final = ("button", "odometry_off", "mute")
+SWITCHES: Final = ("button", "odometry_off", "deaf", "silent", "mute", "battery_empty")
 _MAX_BYTES: Final = 4096
 _MAX_COMMAND: Final = 100.0  # m/s or rad/s: far beyond the base, which clips to its own limits
-
-
-@dataclass(frozen=True)
-class _NoNumbers:
-    """Faults with a value: none."""
 
 
 class Ros2FrontEnd(CameraFrontEnd):
@@ -49,13 +44,16 @@ class Ros2FrontEnd(CameraFrontEnd):
         self._malformed = self._pictures = 0
         self._now_s = 0.0
         self._commanded_s: float | None = None  # of the command in force
-        self._faults: PlanFaults[_NoNumbers] | None = None
+        self._faults: PlanFaults[Impairment] | None = None
+        self._inwards = ImpairedDirection[tuple[Vec3, int]](options.seed, 0)
+        self._outwards = ImpairedDirection[tuple[str, Any]](options.seed, 1)
+        self._senders: dict[object, int] = {}  # publication handle -> number in order of appearance
         self._pressed = self._closed = False
         self.bus = Bus(dds)
         """DDS participant; a process may have one per domain."""
         try:
             if options.faults is not None:
-                self._faults = PlanFaults(options.faults, _NoNumbers(), SWITCHES)
+                self._faults = PlanFaults(options.faults, PERFECT, SWITCHES)
             if options.camera_size is not None:
                 more = ["--domain", str(dds.domain), "--interface", dds.interface]
                 more += [argument for peer in dds.peers for argument in ("--peer", peer)]
@@ -83,18 +81,23 @@ class Ros2FrontEnd(CameraFrontEnd):
         """Obey the received commands and return them."""
         commands = []
         for sample in take_each(self._commands, max_bytes=_MAX_BYTES):
-            received_ns = time.monotonic_ns()
             velocity = None if sample is None else _velocity(sample)
-            if "mute" in self._active:
+            if not self._active.isdisjoint(("deaf", "mute")):
                 continue
             if velocity is None:
                 self._malformed += 1
                 continue
+            sender = self._senders.setdefault(sample.sample_info.publication_handle, len(self._senders))
+            self._inwards.put((velocity, sender), self._impairment, self._now_s)
+        for velocity, sender in self._inwards.take(self._now_s):
             self._robot.command(*velocity)
             self._commanded_s = self._now_s
             self._log.move("Twist", velocity)
             content = json.dumps(dict(zip("xyz", velocity, strict=True)))
-            commands.append(ReceivedCommand(received_ns, "cmd_vel", 0, "Twist", content))
+            received = ReceivedCommand(
+                time.monotonic_ns(), "cmd_vel", 0, "Twist", content, velocity=velocity, source=sender
+            )
+            commands.append(received)
         if self._camera is not None:
             self._pictures += sum(event["event"] == "picture" for event in self._camera.events())
         return commands
@@ -106,11 +109,16 @@ class Ros2FrontEnd(CameraFrontEnd):
         if self._commanded_s is not None and stamp_s - self._commanded_s >= BASE_TIMEOUT_S:
             self._robot.command(0.0, 0.0, 0.0)
             self._commanded_s = None
-        due = [] if "mute" in self._active else self._reports.due(step)
+        due = [] if not self._active.isdisjoint(("silent", "mute")) else self._reports.due(step)
         if "odometry_off" in self._active:
             due = [topic for topic in due if topic != ODOMETRY_TOPIC]
         if due:
-            self._reports.publish(due, self._sensors.read(stamp_s), self._robot.truth(stamp_s), stamp_s)
+            self._sensors.is_empty = "battery_empty" in self._active
+            messages = self._reports.messages(due, self._sensors.read(stamp_s), self._robot.truth(stamp_s), stamp_s)
+            for message in messages:
+                self._outwards.put(message, self._impairment, stamp_s)
+        for topic, message in self._outwards.take(stamp_s):
+            self._reports.write(topic, message)
 
     def _apply_faults(self) -> None:
         if self._faults is None:
@@ -123,6 +131,10 @@ class Ros2FrontEnd(CameraFrontEnd):
             self._robot.release_estop()
             self._robot.stand()
         self._pressed = pressed
+
+    @property
+    def _impairment(self) -> Impairment:
+        return PERFECT if self._faults is None else self._faults.plan
 
     @property
     def _active(self) -> set[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
 from firmware_bridge.dds.bus import Bus
@@ -134,7 +134,7 @@ def camera_info(width: int, height: int, stamp_s: float) -> CameraInfo_:
 
 
 class Reports:
-    """Publishers of the base; `publish` writes what is due. All are reliable, as a driver's default profile is."""
+    """Publishers of the base: `messages` makes what is due. All are reliable, as a driver's default profile is."""
 
     def __init__(self, bus: Bus, rate_hz: int) -> None:
         """`rate_hz`: physics steps a second."""
@@ -153,8 +153,10 @@ class Reports:
         """Return the topics that are due after this physics step."""
         return [topic for topic, every in self._steps.items() if step % every == 0]
 
-    def publish(self, due: Sequence[str], sensors: Sensors, truth: CarterTruth, stamp_s: float) -> None:
-        """Write these topics. Raises a DDS error."""
+    def messages(
+        self, due: Sequence[str], sensors: Sensors, truth: CarterTruth, stamp_s: float
+    ) -> Iterator[tuple[str, Any]]:
+        """Yield these topics with their messages."""
         for topic in due:
             message: Any
             if topic == ODOMETRY_TOPIC:
@@ -164,7 +166,11 @@ class Reports:
                 message = transforms(sensors, stamp_s)
             else:
                 message = imu(sensors, truth, stamp_s) if topic == IMU_TOPIC else battery(sensors, stamp_s)
-            self._writers[topic].write(message)
+            yield topic, message
+
+    def write(self, topic: str, message: Any) -> None:
+        """Write one message. Raises a DDS error."""
+        self._writers[topic].write(message)
 
 
 def _about_z(angle_rad: float) -> Quaternion_:

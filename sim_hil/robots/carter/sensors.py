@@ -19,6 +19,8 @@ GYRO_BIAS_RADPS: Final = 0.002
 GYRO_NOISE_RADPS: Final = 0.002
 ACCEL_BIAS_MPS2: Final = 0.03
 ACCEL_NOISE_MPS2: Final = 0.03
+EMPTY_PERCENT: Final = 3.0
+"""Reported charge of a battery that is nearly empty, %."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,8 @@ class CarterSensors:
         self._wheels_pose = SE2(0.0, 0.0, 0.0)
         self._time_s = 0.0
         self._error = (0.0, 0.0)  # of the reported velocity, m/s and rad/s
+        self.is_empty = False
+        """Whether the battery reads nearly empty."""
 
     def read(self, time_s: float) -> Sensors:
         """Return the reading at a time, s; times must not decrease."""
@@ -74,7 +78,7 @@ class CarterSensors:
             wheel_counts=(odometry.left_counts, odometry.right_counts),
             gyro_radps=(float(gyro[0]), float(gyro[1]), float(gyro[2])),
             accel_mps2=(float(accel[0]), float(accel[1]), float(accel[2])),
-            charge_percent=battery.soc_percent,
+            charge_percent=EMPTY_PERCENT if self.is_empty else battery.soc_percent,
             voltage_v=battery.voltage_v,
             current_a=battery.current_a,
             bumpers=(bumpers.front, bumpers.rear, bumpers.left, bumpers.right),

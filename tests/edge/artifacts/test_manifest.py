@@ -143,6 +143,16 @@ def without(section: str) -> Edit:
     return lambda m: m.pop(section)
 
 
+LARGE = {"bytes": 500 << 20, "sha256": "0" * 64}
+
+
+def nested(depth: int) -> object:
+    content: object = {}
+    for _ in range(depth):
+        content = {"x": content}
+    return content
+
+
 WRONG: list[tuple[str, list[Edit]]] = [
     (
         "not a plain name",
@@ -158,8 +168,31 @@ WRONG: list[tuple[str, list[Edit]]] = [
             with_runtime(control_cores=3), with_runtime(reasoning_cores=[-1]), with_runtime(max_context=0),
             with_runtime(control_priority=60), with_runtime(control_priority=100),  # 60 is the bridge's
             with_runtime(max_new_tokens=-1), with_runtime(step_s="0.1"), with_runtime(image_px=True),
+            with_runtime(max_new_tokens=48.5),
         ],
     ),
+    ("step_s 999999, expected 0.02 to 0.5", [with_runtime(step_s=999_999)]),
+    ("step_s is 0.2, the network was built for 0.1", [with_runtime(step_s=0.2)]),
+    ("tick_period_ms 1, expected 20 to 1000", [with_runtime(tick_period_ms=1)]),
+    ("tick_period_ms is 200, the plan's is 100", [with_runtime(tick_period_ms=200)]),
+    ("must grow by a tick of 0.1 s", [with_runtime(frame_offsets_s=offsets) for offsets in ([0, 0.001], [3, 0])]),
+    ("max_context 128 is too short: 4 frames of 16 tokens, text and an answer", [with_runtime(max_context=128)]),
+    ("expected different cores from 0 to 1023", [with_runtime(control_cores=cores) for cores in ([9999], [1, 1])]),
+    ("core 90 is used, the target has the cores", [with_runtime(reasoning_cores=[90])]),
+    ("in control_cores and in reasoning_cores", [with_runtime(control_cores=[0], reasoning_cores=[0])]),
+    ("special token ids .* are not distinct", [with_runtime(img_end_id=3)]),
+    ("<img> is id 3, the network was built for 7", [with_runtime(img_start_id=7)]),
+    ("nested deeper than 32 levels", [lambda m: m.update(plan=nested(40))]),
+    ("bytes, expected at most", [lambda m: m["files"]["report.json"].update(bytes=10 << 30)]),
+    ("bytes together, expected at most", [lambda m: m["files"].update({f"{n}.onnx": LARGE for n in range(5)})]),
+    ("has a tensor of shape", [lambda m: m["graphs"]["vision_encoder"]["inputs"][0].update(shape=[1, 1 << 40])]),
+    ("self_test: ", [
+        lambda m: m["self_test"].pop("seed"), lambda m: m["self_test"].update(limit_s=1e9),
+        lambda m: m["self_test"]["answers"].pop("chain"), lambda m: m.update(self_test=[]),
+        lambda m: m["self_test"]["answers"]["chain"].update(tolerance=1.0),
+        lambda m: m["self_test"]["answers"]["chain"].update(digest=[0.0] * 16),
+        lambda m: m["self_test"]["answers"]["chain"].update(tokens=[-1]),
+    ]),
     ("runtime has", [with_runtime(max_speed=9)]),
     (
         "expected.*constrained",
@@ -197,6 +230,27 @@ def test_a_manifest_has_defaults_of_the_switches(copy: Path, change: Edit, switc
     edit_manifest(copy, change)
     runtime = load_artifacts(copy).runtime
     assert (runtime.decoding, runtime.recovery) == switches
+
+
+def test_an_older_export_is_refused_with_the_command_that_makes_it_again(copy: Path) -> None:
+    edit_manifest(copy, version(3))
+    command = f"edge-export --target cpu --model nano --out {copy}"
+    with pytest.raises(ArtifactError, match=f"schema version 3, expected {SCHEMA_VERSION}; .*: {command}$"):
+        load_artifacts(copy)
+
+
+def test_a_large_sparse_file_is_refused_without_reading_it(copy: Path) -> None:
+    with (copy / "report.json").open("wb") as file:
+        file.truncate(60 << 20)
+    # Its size is that of the manifest, so only its hash tells; above the limit of its kind it is not even opened.
+    entry = {"bytes": 60 << 20, "sha256": "0" * 64}
+    edit_manifest(copy, lambda m: m["files"].update({"report.json": entry}))
+    with pytest.raises(ArtifactError, match=r"report\.json: sha256"):
+        load_artifacts(copy)
+    edit_manifest(copy, lambda m: m["files"].update({"report.json": {**entry, "bytes": 10 << 30}}))
+    (copy / "report.json").unlink()
+    with pytest.raises(ArtifactError, match=r"report\.json has 10737418240 bytes, expected at most"):
+        load_artifacts(copy)
 
 
 def test_a_graph_that_differs_from_the_manifest_is_refused_when_opened(copy: Path) -> None:

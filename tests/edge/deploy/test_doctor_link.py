@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from edge.deploy.doctor.check import Check, Level
-from edge.deploy.doctor.link import can_interface, robot_links, serial_line, signing_key
+from edge.deploy.doctor.link import can_interface, dbc_file, robot_links, serial_line, signing_key
 from edge.deploy.doctor.rights import UserRights, current_user
 from edge.deploy.doctor.robot import bridge, robot_link
 from firmware_bridge.core.config import RobotConfig, load_robot_config
@@ -117,12 +117,38 @@ def test_a_missing_key_fails_and_an_unsigned_network_is_a_warning(tmp_path: Path
     assert signing_key(None, "", tmp_path).level is Level.OK
 
 
+def can_base(interface: str = "socketcan", **changes: Any) -> RobotConfig:
+    """The example base, with changes of [can]."""
+    base = load_robot_config(GO2_SIM.with_name("example_can.toml"))
+    assert base.can is not None
+    return replace(base, can=replace(base.can, interface=interface, **changes))
+
+
+def test_a_dbc_file_that_fits_the_robot_file_shows_its_messages_and_its_load() -> None:
+    check = dbc_file(can_base())
+    assert check.level is Level.OK and "4 messages received, 3 sent" in check.found and "% of the bus" in check.found
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"dbc": Path("/nowhere/base.dbc")}, "can.dbc: /nowhere/base.dbc: expected a DBC file"),
+        ({"node": "Nobody"}, "can.node: expected a node of"),
+        ({"heartbeat": "WheelSpeed"}, "can.heartbeat: WheelSpeed: expected Computer as its sender"),
+        ({"bitrate_bps": 20_000}, "can.max_load"),
+    ],
+)
+def test_a_dbc_file_that_does_not_fit_is_named_without_a_bus(changes: dict[str, Any], text: str) -> None:
+    check = dbc_file(can_base(**changes))
+    assert check.level is Level.FAIL and text in check.found and "\n" not in check.found
+
+
 @pytest.mark.parametrize(
     ("of", "names"),
     [
-        (parts_of(can="socketcan"), ["CAN interface"]),
-        (parts_of(can="udp_multicast"), ["CAN interface"]),
-        (parts_of(can="serial", channel="/dev/ttyUSB0"), ["serial line"]),
+        (can_base("socketcan"), ["CAN interface", "DBC file"]),
+        (can_base("udp_multicast"), ["CAN interface", "DBC file"]),
+        (can_base("serial", channel="/dev/ttyUSB0"), ["serial line", "DBC file"]),
         (parts_of(mavlink="serial:/dev/ttyACM0:57600"), ["serial line", "MAVLink signing"]),
         (parts_of(mavlink="udp:10.0.0.1:14550"), ["MAVLink signing"]),
         (load_robot_config(GO2_SIM), ["robot's cable"]),

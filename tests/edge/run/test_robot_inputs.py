@@ -256,6 +256,17 @@ def test_half_of_the_states_lost_later_is_found_in_time(rig: Rig) -> None:
     assert "link-lossy" in rig.active
 
 
+def test_a_rate_that_the_bridge_lowers_before_the_robot_moves_is_no_loss(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = Rig(monkeypatch)
+    for _ in range(150):  # 3 s
+        rig.bench.now_ns += REPORT_NS
+        rig.report()
+    rig.alter = every(2, 1)
+    rig.bench.now_ns += REPORT_NS
+    rig.drive(4)
+    assert rig.active == ()
+
+
 def test_a_picture_is_seen_with_the_attitude_of_its_own_instant(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[Attitude] = []
     eye = SimpleNamespace(step=lambda grey, stamp_ns, attitude: seen.append(attitude))

@@ -127,7 +127,9 @@ def test_other_number_types_are_refused(
     assert "mlp1.0.bias is " in refusal(path)
 
 
-@pytest.mark.parametrize("shard", ["../../x", "/etc/passwd", "..", "", "a/b.safetensors", "link.safetensors"])
+@pytest.mark.parametrize(
+    "shard", ["../../x", "/etc/passwd", "..", "", "a/b.safetensors", "link.safetensors", "a\0b", "\ud800", "\x1b[2J"]
+)
 def test_a_shard_outside_the_directory_is_refused(vlm: Path, tmp_path: Path, shard: str) -> None:
     (vlm / "model.safetensors").rename(tmp_path / "x")
     (vlm / "link.safetensors").symlink_to(tmp_path / "x")

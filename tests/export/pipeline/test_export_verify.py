@@ -37,15 +37,16 @@ def resealed(directory: Path, keys: str, value: object) -> Path:
 @pytest.mark.parametrize(
     ("keys", "value", "message"),
     [
-        ("runtime/tick_period_ms", 900, "runtime.tick_period_ms is 900, this export writes 100"),
-        ("runtime/img_context_id", 7, "runtime.img_context_id is 7"),
-        ("runtime/frame_offsets_s", [0.0, 3.0, 6.0, 1.0], "runtime.frame_offsets_s is"),
+        ("runtime/tick_period_ms", 900, "runtime: tick_period_ms is 900, the plan's is 100"),
+        ("runtime/img_context_id", 7, "tokenizer.json: <IMG_CONTEXT> is id 5, the network was built for 7"),
+        ("runtime/frame_offsets_s", [0.0, 1.0, 3.0, 6.0], "runtime.frame_offsets_s is"),
         ("runtime/max_new_tokens", 47, "runtime.max_new_tokens is 47"),
         ("graphs/action_expert/session/threads", 2, "graphs.action_expert.session.threads is 2"),
         ("graphs/vision_encoder/precision/default", "int8", 'graphs.vision_encoder.precision.default is "int8"'),
         ("model/name", "1b", 'model.name is "1b"'),
         ("model/trained", True, "model.trained is true, this export writes false"),
-        ("model/config/action/step_s", 0.2, "model.config.action.step_s is 0.2"),
+        ("model/config/action/step_s", 0.2, "step_s is 0.1, the network was built for 0.2"),
+        ("model/config/action/layers", 5, "model.config.action.layers is 5"),
         ("provenance/target/gates/action_expert/max_abs", 9.0, "gates.action_expert.max_abs is 9.0"),
     ],
 )

@@ -96,7 +96,9 @@ def test_a_file_that_is_not_a_target_is_refused_by_name(tmp_path: Path, text: st
         (lambda t: t["runtime"].update(kv_dtype="int2"), "kv_dtype 'int2' is not known"),
         (lambda t: t["runtime"].update(prefill_chunk_tokens=99999999), "tokens 99999999 must be 1 to 8192"),
         (lambda t: t["runtime"].update(max_new_tokens=8193), "max_new_tokens 8193 must be 1 to 8192"),
-        (lambda t: t["runtime"].update(tick_period_ms=0), "tick_period_ms 0 must be 1 to 60000"),
+        (lambda t: t["runtime"].update(tick_period_ms=0), "tick_period_ms 0 must be 20 to 1000"),
+        (lambda t: t["runtime"].update(tick_period_ms=1), "tick_period_ms 1 must be 20 to 1000"),
+        (lambda t: t["runtime"].update(frame_offsets_s=[0.0, 0.001]), "must grow by a tick of 0.1 s or more"),
         (lambda t: t["runtime"].update(control_priority=100), "control_priority 100 must be 0 to 59"),
         (
             lambda t: t["runtime"].update(control_priority=60),

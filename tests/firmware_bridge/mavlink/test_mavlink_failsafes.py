@@ -16,13 +16,13 @@ S = 1_000_000_000
 PX4 = robot_file().mavlink
 ARDUPILOT = robot_file(ROBOTS / "rover_ardupilot.toml", link="udp:127.0.0.1:14580").mavlink
 GOOD = {
-    "px4": {"COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 5, "NAV_DLL_ACT": 1, "COM_DL_LOSS_T": 3.5},
+    "px4": {"COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 5, "COM_DL_LOSS_T": 3.5},
     "ardupilot": {
         "FS_GCS_ENABLE": 1, "FS_ACTION": 2, "FS_TIMEOUT": 1.5, "FS_GCS_TIMEOUT": 5.0, "SYSID_MYGCS": 254,
     },
 }  # fmt: skip
 WEAK = {
-    "px4": {"COM_OF_LOSS_T": 1.5, "COM_OBL_RC_ACT": 0, "NAV_DLL_ACT": 0, "COM_DL_LOSS_T": 20.0},
+    "px4": {"COM_OF_LOSS_T": 1.5, "COM_OBL_RC_ACT": 0, "COM_DL_LOSS_T": 20.0},
     "ardupilot": {
         "FS_GCS_ENABLE": 0, "FS_ACTION": 0, "FS_TIMEOUT": 30.0, "FS_GCS_TIMEOUT": 60.0, "SYSID_MYGCS": 255,
     },
@@ -107,10 +107,10 @@ def test_both_names_of_a_renamed_parameter_are_tried() -> None:
 
 def test_the_bridge_refuses_a_rover_with_a_weak_failsafe_by_its_name() -> None:
     bench = RoverBench()
-    bench.node.parameters._values["NAV_DLL_ACT"] = 0.0
+    bench.node.parameters._values["COM_OBL_RC_ACT"] = 0.0
     bench.speed = (0.5, 0.0)
     bench.until(lambda: bench.status is not None and bench.status.cause == "unsafe_robot", 3.0, "a refusal")
-    assert bench.status is not None and "NAV_DLL_ACT" in bench.status.reason and not bench.node.vehicle.armed
+    assert bench.status is not None and "COM_OBL_RC_ACT" in bench.status.reason and not bench.node.vehicle.armed
 
 
 def test_a_failsafe_that_is_weakened_while_driving_stops_the_rover() -> None:

@@ -35,7 +35,7 @@ def test_it_finds_a_rover_that_can_be_armed(session: Session) -> None:
 
 def test_it_reads_all_parameters_and_sets_one(session: Session) -> None:
     assert session.seen["parameters"]["COM_OF_LOSS_T"] == pytest.approx(0.5)
-    integers = {"COM_OBL_RC_ACT": 5, "MAV_GCS_SYSID": 0, "MAV_SYS_ID": 1, "NAV_DLL_ACT": 1}
+    integers = {"COM_OBL_RC_ACT": 5, "MAV_GCS_SYSID": 0, "MAV_SYS_ID": 1}
     assert session.seen["integer_parameters"] == integers
     assert session.seen["set_and_read_back"] == pytest.approx(0.8)
 

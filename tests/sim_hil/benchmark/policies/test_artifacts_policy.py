@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,8 @@ import pytest
 from edge.artifacts.files import ArtifactError
 from edge.artifacts.manifest import Artifacts
 from edge.core.geometry import SE2
+from edge.flightlog.part import encode
+from edge.flightlog.schemas import SCHEMAS
 from edge.reasoning.prompt import InstructionError
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError, PolicySpec
 from sim_hil.benchmark.conditions.latency import LatencyProfile
@@ -20,6 +23,7 @@ from sim_hil.benchmark.conditions.variants import VARIANTS, artifact_directory, 
 from sim_hil.benchmark.env.observation import Observation
 from sim_hil.benchmark.policies.artifacts_policy import ArtifactsPolicy, check_suits
 from sim_hil.benchmark.policies.select import camera_for, check_artifacts, open_policy, robot_config
+from tests.edge.flightlog.test_log_schemas import complaints
 from tests.support.benchmark import dynanav_fakes as fakes
 
 LIMITS = robot_config().limits
@@ -38,6 +42,16 @@ def policies(artifacts_dir: Path) -> Iterator[dict[str, ArtifactsPolicy]]:
     yield opened
     for policy in opened.values():
         policy.close()
+
+
+class Sink:
+    """A recorder that keeps topics and records."""
+
+    def __init__(self, records: list[tuple[str, Any]]) -> None:
+        self._records = records
+
+    def put(self, topic: str, stamp_ns: int, payload: Any) -> None:
+        self._records.append((topic, payload))
 
 
 def drive(policy: ArtifactsPolicy, ticks: int, *, step_m: float = 0.05, seed: int = 1, obeys: bool = False) -> Rows:
@@ -62,6 +76,19 @@ def test_it_stands_until_the_first_latency_is_over_and_drives_from_then_on(
     rows = drive(policies["async"], 8)
     assert [command == (0.0, 0.0, 0.0) for command, _ in rows] == [True] * 5 + [False] * 3
     assert [notes["reason"] for _, notes in rows[:6]] == ["no-semantic-state"] * 5 + ["ok"]
+
+
+def test_an_episode_is_recorded_like_a_flight_of_the_runner(policies: dict[str, ArtifactsPolicy]) -> None:
+    policy, records = policies["async"], []
+    policy.recorder = Sink(records)
+    try:
+        drive(policy, 8)
+    finally:
+        policy.recorder = None
+    topics = [topic for topic, _ in records]
+    assert [topics.count(topic) for topic in ("/run", "/tick", "/camera", "/semantic")] == [1, 8, 8, 1]
+    for topic, record in records:
+        assert topic == "/camera" or complaints(json.loads(encode(record, 1)), SCHEMAS[topic]) == []
 
 
 def test_the_model_receives_the_delay_and_motion_of_virtual_time(policies: dict[str, ArtifactsPolicy]) -> None:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_hil.protocols.mavlink.udp import ImpairedDirection, Impairment
+from sim_hil.protocols.impairment import ImpairedDirection, Impairment
 
 COUNT = 4000
 PERIOD_S = 0.01

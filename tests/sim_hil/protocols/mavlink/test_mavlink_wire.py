@@ -163,3 +163,12 @@ def test_a_value_out_of_range_or_of_another_type_changes_nothing(name: str, valu
     assert parameters.set(param_set(name, value)) == name
     assert parameters[name] == TABLE[name].default
     assert parameters.set(param_set("NO_SUCH_ONE", 1.0)) is None
+
+
+def test_a_reader_that_starts_an_hour_later_accepts_a_writer_whose_clock_was_advanced() -> None:
+    key, hour_ticks = bytes(range(32)), 3600 * 100_000
+    writer, late = Writer(1, 1, key, 10**12), Reader(Verifier(key, 10**12 + hour_ticks))
+    heartbeat = common.MAVLink_heartbeat_message(10, 12, 0, 0, 4, 3)
+    assert late.read(writer.pack(heartbeat)) == []
+    writer.advance(10**12 + hour_ticks)
+    assert len(late.read(writer.pack(heartbeat))) == 1

@@ -1,6 +1,6 @@
 """Runs edge-run with a plan that keeps the robot moving, and with internal faults that can be switched on.
 
-    python -m tools.faults.faulty_runner SOCKET --artifacts DIR --robot FILE.toml --instruction TEXT ...
+    python -m tools.faults.rig.faulty_runner SOCKET --artifacts DIR --robot FILE.toml --instruction TEXT ...
 
 The product has no hook for faults: this program replaces methods in its own process and then calls the unchanged
 `edge.run.command.main` with the arguments after SOCKET. It also replaces the plan of `Policy.act` (`circle.py`) and the
@@ -31,8 +31,8 @@ from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
 from edge.run import command as runner
 from edge.state.reasoning_text import format_waypoints
-from tools.faults import circle
-from tools.faults.switches import Switches
+from tools.faults.rig import circle
+from tools.faults.rig.switches import Switches
 
 STEP_S = 0.1
 # Untrained weights write no waypoints, and a text without waypoints is a fault.

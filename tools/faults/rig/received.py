@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from bisect import bisect_right
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -86,3 +87,22 @@ def longest_gap_ms(stamped: Sequence[tuple[int, Velocity]], begin_ns: int, end_n
     """Return the longest time without a command in a window, including both ends, ms."""
     stamps = [begin_ns, *(t_ns for t_ns, _ in stamped if begin_ns <= t_ns <= end_ns), end_ns]
     return max(b - a for a, b in itertools.pairwise(stamps)) / 1e6
+
+
+def longest_age_ms(received_ns: Sequence[int], obeys: Sequence[tuple[int, bool]], begin_ns: int, end_ns: int) -> float:
+    """Return the longest age of the newest received command while the robot obeys motion, in a window, ms.
+
+    `received_ns`: times of the received commands; `obeys`: times at which the robot began or ceased to obey motion.
+    Both are in order and also contain what was before the window.
+    """
+    longest_ns = 0
+    edges = [*obeys, (end_ns, False)]
+    for (since_ns, moving), (until_ns, _) in itertools.pairwise(edges):
+        first_ns, last_ns = max(since_ns, begin_ns), min(until_ns, end_ns)
+        if not moving or first_ns >= last_ns:
+            continue
+        before = received_ns[: bisect_right(received_ns, first_ns)]
+        within = received_ns[bisect_right(received_ns, first_ns) : bisect_right(received_ns, last_ns)]
+        stamps = [*before[-1:], *within, last_ns]
+        longest_ns = max(longest_ns, *(b - a for a, b in itertools.pairwise(stamps)), 0)
+    return longest_ns / 1e6

@@ -1,11 +1,12 @@
 """Rig of robot's side, bridge and runner as real processes on loopback, with the operations of the faults.
 
-A robot on DDS also gets a sniffer, which stamps requests in a process of its own and distinguishes their writers. The
-other protocols' front ends stamp what they receive in a thread of their own; it is in the trace of edge-hil.
+A sniffer stamps requests in a process of its own and distinguishes their writers. MAVLink's UDP link has one receiver
+only: there the trace of edge-hil has the requests as its front end receives them.
 """
 
 from __future__ import annotations
 
+import secrets
 import signal
 import statistics
 import subprocess
@@ -16,16 +17,28 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
+import can
+
+from firmware_bridge.can.frame import ERROR_BUS_OFF, ERROR_RESTARTED
+from firmware_bridge.can.multicast import LoopbackMulticastBus
 from firmware_bridge.core.config import RobotConfig, load_robot_config
 from sim_hil.processes.child_process import last_lines
 from sim_hil.protocols.fault_socket import FaultClient, FaultError
 from sim_hil.realtime.children import Child, Children, StepError
-from sim_hil.realtime.robots import BRIDGE_SOCKET, GO2, RunAddress, StackRobot
+from sim_hil.realtime.robots import (
+    BRIDGE_SOCKET,
+    CAN_BETWEEN_PROCESSES,
+    GO2,
+    MAVLINK_KEY,
+    MAVLINK_SIGNED,
+    RunAddress,
+    StackRobot,
+)
 from sim_hil.realtime.stack import COMMANDS, READY_LINE
 from sim_hil.realtime.truth import LineTail
 from tools.demo import INSTRUCTION
-from tools.faults.circle import SPEED_MPS
-from tools.faults.received import ReceivedCommands
+from tools.faults.rig.circle import SPEED_MPS
+from tools.faults.rig.received import ReceivedCommands
 
 READY_TIMEOUT_S = 90.0
 MOVING_TIMEOUT_S = 60.0
@@ -58,12 +71,21 @@ class Rig:
         Raises StackRobotError for a robot that cannot be driven here.
         """
         self.folder = folder
-        self.stack_robot = stack_robot
+        # A serial line has room for two processes, the bus between processes also for a sniffer and a second commander.
+        harder = {"can": CAN_BETWEEN_PROCESSES, "mavlink": MAVLINK_SIGNED}
+        self.stack_robot = harder.get(stack_robot.protocol, stack_robot)
+        key = folder / MAVLINK_KEY
+        key.touch(0o600)
+        key.write_text(secrets.token_hex(32), encoding="ascii")
         self.address = RunAddress.free(folder, domain)
-        self._robot_file = stack_robot.write_file(folder / "robot.toml", self.address)
+        self._robot_file = self.stack_robot.write_file(folder / "robot.toml", self.address)
         self.config: RobotConfig = load_robot_config(self._robot_file)
-        self._sniffs = stack_robot.protocol == "unitree"
+        places = {"can": "{can_group}", "mavlink": f"{{udp_port}},{{folder}}/{MAVLINK_KEY}"}
+        self._bus = self.address.filled(places.get(stack_robot.protocol, "{domain}"))
+        self._sniffs = stack_robot.protocol != "mavlink"
         self.received = ReceivedCommands(folder / ("received.jsonl" if self._sniffs else "trace.jsonl"))
+        self.stand_in = self._is_stand_in = False
+        """Whether the next injection may be made into a run of the runner's stand-in."""
         self.jump_m = 1.0
         self.needs_operator = False
         self._artifacts = artifacts
@@ -71,7 +93,8 @@ class Rig:
         self._log = log
         self._children = Children(folder, grace_s=5.0)
         self._trace = LineTail(folder / "trace.jsonl")
-        self._commanded: list[tuple[int, bool]] = []
+        self._obeys: list[tuple[int, bool]] = []
+        self._accepted_ns: list[int] = []
         self._runs = 0
         self._rogues: list[Child] = []
         self.hil: Child | None = None
@@ -105,7 +128,7 @@ class Rig:
         self.hil = self._children.start("edge-hil", [*COMMANDS["edge-hil"], *scene, *where])
         waited = [(self.hil, READY_LINE)]
         if self._sniffs:
-            sniffer = [sys.executable, "-m", "tools.faults.sniffer", "--domain", str(self.address.domain)]
+            sniffer = [sys.executable, "-m", "tools.faults.rig.sniffer", self.stack_robot.protocol, self._bus]
             child = self._children.start("sniffer", [*sniffer, "--out", str(self.folder / "received.jsonl")])
             waited.append((child, "sniffer: ready"))
         for child, line in waited:
@@ -117,12 +140,18 @@ class Rig:
         self._wait(partial(_has_printed, self.bridge, "ready"), 30.0, self.bridge, "ready line")
 
     def start_runner(self) -> None:
-        """Start edge-run with switchable faults; it arms and drives by itself."""
+        """Start edge-run with switchable faults, or its stand-in; it arms and drives by itself."""
         if self._inside is not None:
             self._inside.close()
+            self._inside = None
         self._runs += 1
+        self._is_stand_in = self.stand_in
+        if self.stand_in:
+            command = [sys.executable, "-m", "tools.faults.rig.driver", *self._link()]
+            self.runner = self._children.start(f"driver-{self._runs}", command)
+            return
         socket = self.folder / f"r{self._runs}.faults"
-        command = [sys.executable, "-m", "tools.faults.faulty_runner", str(socket), *self._link()]
+        command = [sys.executable, "-m", "tools.faults.rig.faulty_runner", str(socket), *self._link()]
         command += ["--artifacts", str(self._artifacts), "--instruction", INSTRUCTION]
         if self._record:
             command += ["--record", str(self.folder / f"flight{self._runs}.mcap")]
@@ -131,6 +160,8 @@ class Rig:
 
     def ensure_moving(self) -> None:
         """Start what is not running and wait until the robot is driven at full speed. Raises StepError."""
+        if self._is_stand_in != self.stand_in:
+            self.kill_runner()
         for _ in range(_ATTEMPTS):
             if self.bridge is None or not self.bridge.running:
                 self.kill_runner()
@@ -215,7 +246,7 @@ class Rig:
 
     def rogue(self, duration_s: float) -> int:
         """Let a second commander drive for `duration_s` or slightly longer; returns its start, ns."""
-        command = [sys.executable, "-m", "tools.faults.rogue", "--domain", str(self.address.domain)]
+        command = [sys.executable, "-m", "tools.faults.rig.rogue", self.stack_robot.protocol, self._bus]
         rogue = self._children.start("rogue", [*command, "--duration", str(duration_s)])
         try:
             self._wait(lambda: "ready" in rogue.log.read_text(), 30.0, rogue, "robot to command")
@@ -232,14 +263,37 @@ class Rig:
             rogue.process.wait(30.0)
         time.sleep(_COMMANDER_S)
 
+    def bus_off(self) -> int:
+        """Report on the CAN bus that the controllers are off; returns the time, ns."""
+        return self._error_frame(ERROR_BUS_OFF)
+
+    def bus_restarted(self) -> None:
+        """Report on the CAN bus that the controllers are on again."""
+        self._error_frame(ERROR_RESTARTED)
+
+    def _error_frame(self, error_class: int) -> int:
+        with LoopbackMulticastBus(self._bus) as bus:
+            sent_ns = time.monotonic_ns()
+            bus.send(can.Message(arbitration_id=error_class, data=bytes(8), is_error_frame=True))
+        return sent_ns
+
     def robot_obeys_motion(self) -> list[tuple[int, bool]]:
         """Return (ns, moving) for each change of the robot's commanded velocity from or to zero, from its trace."""
+        self._read_trace()
+        return self._obeys
+
+    def accepted_ns(self) -> list[int]:
+        """Return the times at which the robot received a valid velocity, ns, from its trace."""
+        self._read_trace()
+        return self._accepted_ns
+
+    def _read_trace(self) -> None:
         for line in self._trace.lines():
-            if line["kind"] == "commanded":
-                velocity = line["velocity"]
-                assert isinstance(velocity, list)
-                self._commanded.append((int(str(line["t_ns"])), any(velocity)))
-        return self._commanded
+            velocity = line.get("velocity")
+            if line["kind"] == "commanded" and isinstance(velocity, list):
+                self._obeys.append((int(line["t_ns"]), any(velocity)))
+            elif line["kind"] == "wire" and velocity is not None:
+                self._accepted_ns.append(int(line["t_ns"]))
 
     def clear(self) -> None:
         """Switch every fault off, in edge-hil and in the runner if it still runs."""

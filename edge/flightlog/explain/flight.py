@@ -1,0 +1,163 @@
+"""A flight log as the rules of `edge.flightlog.explain.verdict` read it: ticks, generations, faults and truth."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left, bisect_right
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from edge.core.geometry import SE2
+from edge.flightlog.reader import RecordingError, read_messages
+from edge.flightlog.replay.records import RecordedGeneration, RecordedTick, read_events, read_run
+from edge.flightlog.standard_messages import Mount
+
+_ROUTE_NEAR_NS = 600_000_000
+"""Largest distance in time of a shortest path from the instant that it is used for, ns."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """State of a simulated world at one instant."""
+
+    stamp_ns: int
+    T_world_base: SE2
+    people: tuple[tuple[float, float], ...] = ()
+    """Places of the people near the robot, m, in the world."""
+    touching: tuple[str, ...] = ()
+    route_m: float | None = None
+    """Length of the shortest path to the goal."""
+    route_bearing_rad: float | None = None
+    """Direction of that path 3 m ahead, seen from the robot, left positive."""
+
+    @staticmethod
+    def of_record(stamp_ns: int, record: Mapping[str, Any]) -> Truth:
+        """Read a `/truth` record. Raises LookupError, TypeError or ValueError."""
+        return Truth(
+            stamp_ns,
+            SE2(*(float(value) for value in record["pose"])),
+            tuple((float(row[0]), float(row[1])) for row in record["people"]),
+            tuple(str(label) for label in record["touching"]),
+            record.get("route_m"),
+            record.get("route_bearing_rad"),
+        )
+
+
+@dataclass(frozen=True)
+class FaultSpan:
+    """A fault and when it was present, ns; `end_ns` is infinite (2**63) for one that was never cleared."""
+
+    name: str
+    detail: str
+    begin_ns: int
+    end_ns: int
+
+
+@dataclass(frozen=True)
+class Flight:
+    """One run in the order of time; raises ValueError without a tick."""
+
+    instruction: str
+    ticks: Sequence[RecordedTick]
+    generations: Mapping[int, RecordedGeneration]
+    faults: Sequence[FaultSpan] = ()
+    truths: Sequence[Truth] = ()
+    """Empty for a robot without a simulator."""
+    result: Mapping[str, Any] = field(default_factory=dict)
+    mount: Mount | None = None
+    frames_ns: Sequence[int] = ()
+
+    def __post_init__(self) -> None:
+        if not self.ticks:
+            raise ValueError("a flight needs at least one tick")
+
+    @property
+    def start_ns(self) -> int:
+        """Instant of the first tick: zero of all times in s."""
+        return self.ticks[0].now_ns
+
+    @property
+    def end_ns(self) -> int:
+        """Instant of the last tick."""
+        return self.ticks[-1].now_ns
+
+    def seconds(self, at_ns: int) -> float:
+        """Return an instant as s since the first tick."""
+        return (at_ns - self.start_ns) / 1e9
+
+    def ticks_between(self, begin_ns: int, end_ns: int) -> Sequence[RecordedTick]:
+        """Return the ticks of a span of time, both ends included."""
+        first = bisect_left(self.ticks, begin_ns, key=lambda tick: tick.now_ns)
+        return self.ticks[first : bisect_right(self.ticks, end_ns, key=lambda tick: tick.now_ns)]
+
+    def truth_at(self, at_ns: int) -> Truth | None:
+        """Return the newest truth at an instant; None before the first one or without a simulator."""
+        index = bisect_right(self.truths, at_ns, key=lambda truth: truth.stamp_ns)
+        return self.truths[index - 1] if index else None
+
+    def route_at(self, at_ns: int) -> Truth | None:
+        """Return the truth nearest to an instant that has a shortest path; None farther than 0.6 s from it."""
+        low = bisect_left(self.truths, at_ns - _ROUTE_NEAR_NS, key=lambda truth: truth.stamp_ns)
+        high = bisect_right(self.truths, at_ns + _ROUTE_NEAR_NS, key=lambda truth: truth.stamp_ns)
+        near = [truth for truth in self.truths[low:high] if truth.route_bearing_rad is not None]
+        return min(near, key=lambda truth: abs(truth.stamp_ns - at_ns), default=None)
+
+    def faults_at(self, at_ns: int) -> list[FaultSpan]:
+        """Return the faults present at an instant."""
+        return [fault for fault in self.faults if fault.begin_ns <= at_ns <= fault.end_ns]
+
+    def frame_at(self, at_ns: int) -> int | None:
+        """Return the stamp of the newest recorded picture at an instant, ns."""
+        index = bisect_right(self.frames_ns, at_ns)
+        return self.frames_ns[index - 1] if index else None
+
+
+def read_flight(path: Path) -> Flight:
+    """Read a flight log. Raises RecordingError for one without a run or a tick or with a malformed record, OSError."""
+    run, ticks, generations, frames_ns = read_run(path), [], {}, []
+    for event in read_events(path):
+        if isinstance(event, RecordedTick):
+            ticks.append(event)
+        elif isinstance(event, RecordedGeneration):
+            generations[event.number] = event
+        else:
+            frames_ns.append(event.stamp_ns)
+    if not ticks:
+        raise RecordingError(f"{path}: holds no /tick record, the run ended before its first control tick")
+    truths: list[Truth] = []
+    faults: list[FaultSpan] = []
+    result: Mapping[str, Any] = {}
+    mount: Mount | None = None
+    for topic, stamp_ns, payload in read_messages(path):
+        try:
+            if topic == "/truth":
+                truths.append(Truth.of_record(stamp_ns, payload))
+            elif topic == "/fault":
+                _add_fault(faults, stamp_ns, payload)
+            elif topic == "/result":
+                result = payload
+            elif topic == "/run" and payload.get("mount") is not None:
+                mount = Mount.of_record(payload["mount"])
+        except (LookupError, TypeError, ValueError) as error:
+            raise RecordingError(f"{path}: a {topic} record lacks or misshapes a field ({error!r})") from error
+    truths.sort(key=lambda truth: truth.stamp_ns)
+    return Flight(run.instruction, ticks, generations, faults, truths, result, mount, sorted(frames_ns))
+
+
+def _add_fault(faults: list[FaultSpan], stamp_ns: int, record: Mapping[str, Any]) -> None:
+    name = str(record["name"])
+    if record["change"] == "raised":
+        faults.append(FaultSpan(name, str(record["detail"]), stamp_ns, 2**63))
+        return
+    for index in range(len(faults) - 1, -1, -1):
+        fault = faults[index]
+        if fault.name == name and fault.end_ns == 2**63:
+            faults[index] = FaultSpan(name, fault.detail, fault.begin_ns, stamp_ns)
+            return
+
+
+def bearing_rad(point: tuple[float, float]) -> float:
+    """Return the direction of a point in the robot's frame, left positive."""
+    return math.atan2(point[1], point[0])

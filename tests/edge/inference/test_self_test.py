@@ -1,0 +1,204 @@
+"""Artifacts whose manifest is consistent but which do not compute what was exported are refused before a run."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime as ort
+import pytest
+from onnx import TensorProto, helper
+
+from edge.artifacts.files import ArtifactError
+from edge.artifacts.manifest import Artifacts, load_artifacts
+from edge.inference.language import LanguageModel
+from edge.inference.policy import Policy
+from edge.inference.self_test import check_answers
+from edge.inference.start_guard import Memory, StartGuard
+from edge.inference.warm_up import open_proven
+from tests.support.artifact_directory import Floats, change_weight, edit_graph, edit_manifest, replace_file
+
+Damage = Callable[[Path], object]
+
+
+@pytest.fixture
+def copy(artifacts_dir: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))
+
+
+def damaged(graph: str, change: Callable[[Floats], object]) -> Damage:
+    return lambda directory: edit_graph(directory, graph, lambda model: change_weight(model, change))
+
+
+def set_one(value: float, values: Floats) -> None:
+    values[3, 5] = value
+
+
+def scale(factor: float, values: Floats) -> None:
+    values *= np.float32(factor)
+
+
+def flip_largest(values: Floats) -> None:
+    at = np.unravel_index(np.abs(values).argmax(), values.shape)
+    values[at] = -values[at]
+
+
+def swap_rows(values: Floats) -> None:
+    values[[10, 20]] = values[[20, 10]]
+
+
+def zero_all(graph: str, directory: Path) -> None:
+    def change(model: onnx.ModelProto) -> None:
+        for tensor in model.graph.initializer:
+            if tensor.data_type == TensorProto.FLOAT:
+                tensor.raw_data = bytes(len(tensor.raw_data))
+
+    edit_graph(directory, graph, change)
+
+
+def exchange(directory: Path, left: str, right: str) -> None:
+    """Exchange two tokens of the vocabulary."""
+    content = json.loads((directory / "tokenizer.json").read_text())
+    words = content["model"]["vocab"]
+    words[left], words[right] = words[right], words[left]
+    replace_file(directory, "tokenizer.json", json.dumps(content).encode())
+
+
+def exchange_special(directory: Path) -> None:
+    """Exchange the ids of two special tokens in the settings and in the tokenizer."""
+    content = json.loads((directory / "tokenizer.json").read_text())
+    by_id = {entry["id"]: entry for entry in content["added_tokens"]}
+    by_id[3]["id"], by_id[4]["id"] = 4, 3
+    replace_file(directory, "tokenizer.json", json.dumps(content).encode())
+    edit_manifest(directory, lambda m: m["runtime"].update(img_start_id=4, img_end_id=3))
+    edit_manifest(directory, lambda m: m["model"]["config"]["language"].update(img_start_id=4, img_end_id=3))
+
+
+def replace_output(model: onnx.ModelProto, name: str, operator: str) -> None:
+    """Send an output of a graph through one more operator."""
+    for node in model.graph.node:
+        for i, output in enumerate(node.output):
+            if output == name:
+                node.output[i] = "before"
+    model.graph.node.append(helper.make_node(operator, ["before"], [name]))
+
+
+def loop_for_ever(directory: Path) -> None:
+    """Send the trajectory through 2⁶² turns of a loop."""
+
+    def change(model: onnx.ModelProto) -> None:
+        replace_output(model, "trajectory", "Identity")
+        tensors = {name: helper.make_tensor_value_info(name, TensorProto.BOOL, []) for name in ("go", "go_on")}
+        body = helper.make_graph(
+            [helper.make_node("Identity", ["go"], ["go_on"]), helper.make_node("Abs", ["v"], ["w"])],
+            "body",
+            [helper.make_tensor_value_info("i", TensorProto.INT64, []), tensors["go"],
+             helper.make_tensor_value_info("v", TensorProto.FLOAT, [1, 30, 3])],
+            [tensors["go_on"], helper.make_tensor_value_info("w", TensorProto.FLOAT, [1, 30, 3])],
+        )  # fmt: skip
+        last = model.graph.node.pop()
+        model.graph.initializer.append(helper.make_tensor("turns", TensorProto.INT64, [], [1 << 62]))
+        model.graph.initializer.append(helper.make_tensor("true", TensorProto.BOOL, [], [True]))
+        model.graph.node.append(helper.make_node("Loop", ["turns", "true", last.input[0]], last.output, body=body))
+
+    edit_graph(directory, "action_expert", change)
+
+
+def swap_graph(directory: Path) -> None:
+    """Put the encoder of other weights in the place of this one."""
+
+    def change(model: onnx.ModelProto) -> None:
+        rng = np.random.default_rng(0)
+        for tensor in model.graph.initializer:
+            if tensor.data_type == TensorProto.FLOAT and len(tensor.dims) == 2:
+                values = onnx.numpy_helper.to_array(tensor)
+                tensor.raw_data = rng.permuted(values.ravel()).astype(np.float32).tobytes()
+
+    edit_graph(directory, "vision_encoder", change)
+
+
+DAMAGES: dict[str, tuple[Damage, str]] = {
+    "one weight is NaN": (damaged("action_expert", partial(set_one, np.nan)), "action_expert gives 90 numbers"),
+    "one weight is infinite": (damaged("vision_encoder", partial(set_one, np.inf)), "vision_encoder .* not finite"),
+    "all weights are 0": (partial(zero_all, "vision_encoder"), "vision_encoder gives the same answer to everything"),
+    "an expert of zeros": (partial(zero_all, "action_expert"), "action_expert gives the same answer to everything"),
+    "a context of zeros": (partial(zero_all, "semantic_context"), "semantic_context gives the same answer"),
+    "a matrix scaled by 1.02": (damaged("language_model", partial(scale, 1.02)), "language_model answers otherwise"),
+    "a matrix scaled by 0.99": (damaged("vision_encoder", partial(scale, 0.99)), "vision_encoder answers otherwise"),
+    "the sign of one weight": (damaged("semantic_context", flip_largest), "semantic_context answers otherwise"),
+    "two rows exchanged": (damaged("semantic_context", swap_rows), "semantic_context answers otherwise"),
+    "other weights": (swap_graph, "vision_encoder answers otherwise"),
+    "two tokens exchanged": (lambda d: exchange(d, "Ġleft", "Ġright"), "the prompt's token ids are not the exporter's"),
+    "special tokens exchanged": (exchange_special, "the prompt's token ids are not the exporter's"),
+    "a negative next token": (
+        lambda d: edit_graph(d, "language_model", lambda m: replace_output(m, "next_token", "Neg")),
+        r"the graphs do not run \(the language model's next token is -\d+",
+    ),
+}  # fmt: skip
+FAST = ("one weight is NaN", "a matrix scaled by 0.99", "two tokens exchanged")
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [pytest.param(*DAMAGES[name], id=name, marks=() if name in FAST else pytest.mark.slow) for name in DAMAGES],
+)
+def test_artifacts_that_compute_otherwise_are_refused(copy: Path, damage: Damage, message: str) -> None:
+    damage(copy)
+    artifacts = load_artifacts(copy)
+    with pytest.raises(ArtifactError, match=message):
+        open_proven(artifacts)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_the_exported_answers_are_found_again(artifacts: Artifacts, threads: int) -> None:
+    policy, language = Policy(artifacts, threads=threads), LanguageModel(artifacts, threads=threads)
+    assert check_answers(policy, language, artifacts.known_answers).worst_share < 0.1
+
+
+@pytest.mark.slow
+def test_other_kernels_give_the_exported_answers(artifacts: Artifacts, monkeypatch: pytest.MonkeyPatch) -> None:
+    make = ort.SessionOptions
+
+    def without_fusion() -> ort.SessionOptions:
+        options = make()
+        options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
+        return options
+
+    monkeypatch.setattr(ort, "SessionOptions", without_fusion)
+    assert open_proven(artifacts).tested.worst_share < 0.1
+
+
+def test_a_manifest_without_answers_is_refused(artifacts: Artifacts) -> None:
+    with pytest.raises(ArtifactError, match="no known answers for the self-test; export again"):
+        open_proven(dataclasses.replace(artifacts, known_answers=None))
+
+
+def test_a_self_test_that_takes_longer_than_its_limit_is_refused(artifacts: Artifacts) -> None:
+    known = artifacts.known_answers
+    assert known is not None
+    policy, language = Policy(artifacts), LanguageModel(artifacts)
+    with pytest.raises(ArtifactError, match=r"takes longer than its limit of 0\.001 s"):
+        check_answers(policy, language, dataclasses.replace(known, limit_s=0.001))
+
+
+@pytest.mark.slow
+def test_a_graph_that_loops_is_ended_at_the_limit(copy: Path) -> None:
+    loop_for_ever(copy)
+    artifacts = load_artifacts(copy)
+    assert artifacts.known_answers is not None
+    known = dataclasses.replace(artifacts.known_answers, limit_s=1.5)
+    with pytest.raises(ArtifactError, match=r"self-test: not done after its limit of 1\.5 s"):
+        open_proven(dataclasses.replace(artifacts, known_answers=known))
+
+
+def test_a_start_that_takes_more_memory_than_its_limit_is_refused(artifacts: Artifacts) -> None:
+    grown = iter([0, 0])
+    memory = Memory(own=lambda: next(grown, 1 << 40), available=lambda: 1 << 30)
+    with pytest.raises(ArtifactError, match=r"opening the graphs: took 1048576 MiB of memory, its limit is 921 MiB"):
+        open_proven(artifacts, guard=StartGuard(artifacts, memory=memory, end=lambda line: None))

@@ -1,0 +1,73 @@
+"""What the robot file says of a body reaches the parts of a run that use it, whatever the protocol."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+import firmware_bridge
+from edge.inference.release import ReleaseDelay
+from edge.motion.controller import Controller, ControllerConfig
+from edge.reasoning.generation_cycle import Mode
+from edge.run import assembly, robot_inputs
+from edge.run.robot_inputs import RobotInputs
+from edge.safety.monitors.watch import WatchConfig
+from firmware_bridge.core.config import RobotConfig, load_robot_config
+
+ROBOTS = Path(firmware_bridge.__file__).parent / "robots"
+FILES = ("go2_sim", "carter_can_sim", "carter_mavlink_sim", "carter_ros2_sim")
+
+
+@pytest.fixture(params=FILES)
+def robot(request: pytest.FixtureRequest) -> RobotConfig:
+    return load_robot_config(ROBOTS / f"{request.param}.toml")
+
+
+def test_its_limits_reach_the_controller_and_the_monitor_of_the_policys_output(
+    robot: RobotConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    controllers: list[ControllerConfig] = []
+    watches: list[WatchConfig] = []
+    monkeypatch.setattr(assembly, "make_power_monitor", lambda *_args, **_named: SimpleNamespace(budget=None))
+    monkeypatch.setattr(assembly, "read_power_plan", lambda _: SimpleNamespace(max_delay_s=5.0))
+    monkeypatch.setattr(assembly, "Controller", lambda config: controllers.append(config) or Controller(config))
+    monkeypatch.setattr(assembly, "Watch", lambda config, _sources: watches.append(config))
+    monkeypatch.setattr(assembly, "ReasoningLoop", lambda *_args, **_named: SimpleNamespace(cycle=None))
+    runtime = SimpleNamespace(
+        tick_period_ms=100, image_px=32, step_s=0.1, frame_offsets_s=(1.0, 0.0), max_new_tokens=8,
+        decoding="constrained", recovery="on",
+    )  # fmt: skip
+    artifacts = SimpleNamespace(runtime=runtime, trained=True, guided_by_waypoints=False, directory=Path("a"))
+    policy = SimpleNamespace(tokens_shape=(1, 4, 8), artifacts=artifacts)
+    engines: Any = SimpleNamespace(
+        artifacts=artifacts, policy=policy, language=None, activity=None,
+        schedule=SimpleNamespace(shared=False, reasoning=None),
+    )  # fmt: skip
+    reader = SimpleNamespace(state=None, malformed=0)
+    inputs: Any = SimpleNamespace(
+        battery=None, findings=SimpleNamespace(put=None), reader=reader, states=0, offset_covariance=None,
+        history=SimpleNamespace(newest=None), camera=SimpleNamespace(newest=None),
+    )  # fmt: skip
+    options = assembly.RunOptions("go", Mode.ASYNC, None, ReleaseDelay(0.0, 0.0, 0), None)
+    sink: Any = None
+    assembly.assemble(
+        engines, robot, options, inputs, sink, None, stop=threading.Event(), say=print, on_tick=lambda _: None
+    )
+    assert [config.limits for config in controllers] == [robot.limits]
+    assert [config.output.limits for config in watches] == [robot.limits] * 2
+
+
+def test_its_camera_height_and_angle_reach_visual_odometry(robot: RobotConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[Any] = []
+    reader = SimpleNamespace(set_state_listener=lambda _: None, close=lambda: None)
+    source = SimpleNamespace(request_frame=None, captured_ns=None, close=lambda: None)
+    monkeypatch.setattr(robot_inputs, "open_reader", lambda *_: (reader, source))
+    monkeypatch.setattr(robot_inputs, "CameraPoller", lambda *_args, **_named: None)
+    monkeypatch.setattr(robot_inputs, "VisualOdometry", lambda geometry: seen.append(geometry))
+    RobotInputs(robot, image_px=32, period_ns=10**8, commanded=lambda: None, say=print, on_death=print)
+    assert robot.mount is not None
+    assert [(one.height_m, one.forward_m) for one in seen] == [(robot.mount.height_m, robot.mount.forward_m)]

@@ -1,0 +1,89 @@
+"""A benchmark's report says why its episodes failed, from their flight logs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edge.core.geometry import SE2
+from edge.flightlog.explain.flight import read_flight
+from edge.flightlog.standard_messages import jpeg_size
+from sim_hil.benchmark.env.metrics import Outcome
+from sim_hil.benchmark.results.failures import cause_table, counts, failure_sheet, failures
+from sim_hil.benchmark.results.flight import EpisodeFlight
+from sim_hil.scene.scene import load_scene
+from tests.edge.flightlog.test_log_schemas import SAMPLES
+from tests.support.benchmark import dynanav_fakes as fakes
+from tests.support.runner import explained_flights as flights
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run with the flight logs of two missed episodes and one that only collided."""
+    folder = tmp_path_factory.mktemp("run")
+    (folder / "flights").mkdir()
+    for name in ("a", "b"):
+        flights.write(folder / "flights" / f"{name}.mcap")
+    flights.write(folder / "flights" / "c.mcap", 4.5, touch_s=3.0, end="reached")
+    return folder
+
+
+RESULTS = [
+    fakes.missed("a"),
+    fakes.missed("b"),
+    fakes.result("c", collided=True, collisions=("plant",)),
+    fakes.result("d"),
+    fakes.missed("no-log"),
+]
+
+
+def test_failures_are_counted_by_cause(run: Path) -> None:
+    found = failures(run, RESULTS)
+    assert counts(found) == {"missed": {"command limited": 2}, "collided": {"action expert": 1}}
+    rows = cause_table(found).rows
+    assert [tuple(row)[2:5] for row in rows] == [("2", "0", "67"), ("0", "1", "33")]
+    assert rows[0][1] == "the plan drives, the command does not: camera-frozen"
+
+
+def test_the_contact_sheet_shows_each_failure(run: Path) -> None:
+    sheet = failure_sheet(failures(run, RESULTS))
+    assert sheet is not None and jpeg_size(sheet) == (1600, 352)
+
+
+def test_a_damaged_log_leaves_its_episode_out(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "flights").mkdir()
+    (tmp_path / "flights" / "a.mcap").write_bytes((run / "flights" / "a.mcap").read_bytes()[:100])
+    assert failures(tmp_path, [fakes.missed("a")]) == [] and failure_sheet([]) is None
+
+
+class World:
+    """The start of an episode's world, as far as a flight log reads it."""
+
+    def __init__(self) -> None:
+        self.episode = replace(fakes.episode("a"), scene="corridor", goal_xy=(13.0, 0.6))
+        self.scene = load_scene("corridor")
+        self.touching: frozenset[str] = frozenset()
+
+    def pose(self) -> SE2:
+        return SE2(1.0, 0.0, 0.0)
+
+    def people(self) -> np.ndarray[Any, Any]:
+        return np.array([[3.0, 0.0, 0.0], [90.0, 0.0, 0.0]])
+
+
+def test_an_episodes_log_has_the_truth_with_the_path_to_the_goal(tmp_path: Path) -> None:
+    world = World()
+    flight = EpisodeFlight(tmp_path / "flights" / "a.mcap")
+    flight.put("/run", flights.START_NS, SAMPLES["/run"])
+    flight.put("/tick", flights.START_NS, {**SAMPLES["/tick"], "now_ns": flights.START_NS})
+    flight.see(world, flights.START_NS)  # type: ignore[arg-type]
+    outcome = Outcome("a", False, "timeout", 12.0, 0.0, False, (), None, False, 1.0, 12.0, 60.0, "0" * 64)
+    flight.keep(world, outcome)  # type: ignore[arg-type]
+    (truth,) = read_flight(tmp_path / "flights" / "a.mcap").truths
+    assert truth.people == ((3.0, 0.0),), "those within 10 m"
+    assert truth.route_m == pytest.approx(12.0, abs=0.5) and abs(truth.route_bearing_rad or 9.0) < 0.3
+    assert [path.name for path in (tmp_path / "flights").iterdir()] == ["a.mcap"]

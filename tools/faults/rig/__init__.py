@@ -1,0 +1,1 @@
+"""Processes of the fault harness: robot, bridge, runner or its stand-in, sniffer and second commander."""
