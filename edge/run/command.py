@@ -40,7 +40,7 @@ from edge.run.assembly import RunOptions
 from edge.run.instructions import check_first_instruction
 from edge.run.service import operator_lines
 from edge.run.session import RunSession
-from edge.state.switches import Decoding, RecoverySwitch, SwitchOptions
+from edge.state.switches import Decoding, RecoverySwitch, Speculation, SwitchOptions
 from firmware_bridge.client import BridgeUnavailable
 from firmware_bridge.core.config import ConfigError, RobotConfig, load_robot_config
 from firmware_bridge.core.robot_state import LinkOpenError
@@ -121,6 +121,11 @@ def parser() -> argparse.ArgumentParser:
         help="off: only the plan moves the robot (default: the manifest's; usually on)",
     )
     p.add_argument(
+        "--speculation",
+        choices=[each.value for each in Speculation],
+        help="on: verify guessed tokens, faster with the same texts (default: the manifest's; usually on)",
+    )
+    p.add_argument(
         "--stay",
         action=argparse.BooleanOptionalAction,
         help="stand where the texts have placed the stop (default: with --recovery on)",
@@ -158,7 +163,7 @@ def read_options(args: argparse.Namespace) -> tuple[RobotConfig, RunOptions]:
 
 def _switches(args: argparse.Namespace) -> SwitchOptions:
     try:
-        return SwitchOptions.parse(args.decoding, args.recovery, args.stay)
+        return SwitchOptions.parse(args.decoding, args.recovery, args.stay, args.speculation)
     except ValueError as error:
         raise ConfigError(str(error)) from error
 

@@ -145,8 +145,8 @@ class RobotInputs:
         self.states += 1
         now_ns = time.monotonic_ns()
         commanded = self._commanded()
-        if commanded is not None and not self._has_driven:
-            # Some robots change the rate of their reports when the bridge connects: that is no loss.
+        if not self._has_driven and commanded is not None and any(commanded):
+            # Some robots change the rate of their reports when the bridge arms them: that is no loss.
             self._has_driven, self._link = True, LinkMonitor()
         outputs = self._newest = self.estimator.step(
             OdometryInputs(

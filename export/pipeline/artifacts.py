@@ -29,7 +29,7 @@ from reporting.progress import BuildProgress
 
 REPORT_JSON, REPORT_HTML, TOKENIZER_NAME = "report.json", "report.html", "tokenizer.json"
 NEW, OLD = "new", "old"
-RUNNER_KEYS = ("control_cores", "reasoning_cores", "control_priority", "decoding", "recovery")
+RUNNER_KEYS = ("control_cores", "reasoning_cores", "control_priority", "decoding", "recovery", "speculation")
 SHOWN_CHARACTERS = 60
 OLDER_SCHEMAS = (1, 2, 3)
 """Manifest schemas whose directories an export may replace."""

@@ -23,7 +23,7 @@ from edge.core.cli import (
     stop_signals,
     write_result,
 )
-from edge.state.switches import Decoding, RecoverySwitch
+from edge.state.switches import Decoding, RecoverySwitch, Speculation
 from firmware_bridge.core.config import ConfigError
 from sim_hil.benchmark.conditions.conditions import (
     BASELINES,
@@ -128,6 +128,10 @@ def parser() -> argparse.ArgumentParser:
         help="recoveries of an artifact policy; off: only the plan moves the robot (default: the manifest's)",
     )  # fmt: skip
     p.add_argument(
+        "--speculation", choices=[each.value for each in Speculation],
+        help="whether a call verifies guessed tokens; the results are equal bit for bit (default: the manifest's)",
+    )  # fmt: skip
+    p.add_argument(
         "--stay", action=argparse.BooleanOptionalAction, default=False,
         help="halt at the stop that the reasoning text gives, as edge-run does (default: only the goal ends the run)",
     )  # fmt: skip
@@ -196,6 +200,7 @@ def conditions_of(args: argparse.Namespace) -> Conditions:
         swap_instructions=args.swap_instructions,
         decoding=args.decoding,
         recovery=args.recovery,
+        speculation=args.speculation,
         stays=args.stay,
         camera=args.camera,
         external_timeout_s=args.external_timeout,

@@ -63,7 +63,7 @@ class BenchRun:
             )
         artifacts = check_artifacts(conditions)
         if artifacts is not None:
-            conditions = conditions.with_defaults_of(artifacts.runtime.decoding, artifacts.runtime.recovery)
+            conditions = conditions.with_defaults_of(artifacts.runtime.switches)
         sha256, trained = ("", True) if artifacts is None else (artifacts.manifest_sha256, artifacts.trained)
         run = BenchRun(suite, tuple(episodes), conditions, sha256, trained)
         run.tasks(Path())

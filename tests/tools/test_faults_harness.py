@@ -9,12 +9,14 @@ import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from edge.core.geometry import SE2
 from edge.motion.controller import arc_to
 from edge.safety.faults.table import FAULTS
+from firmware_bridge.core.config import load_robot_config
 from sim_hil.protocols.can.node import COMMAND_TIMEOUT_S
 from sim_hil.protocols.fault_socket import FaultClient, FaultError
 from sim_hil.protocols.mavlink.parameters import TABLE
@@ -129,6 +131,14 @@ def test_the_timeout_that_a_row_expects_of_a_robot_is_the_simulated_ones() -> No
     assert ROBOTS["carter-ros2"].own_timeout_s == BASE_TIMEOUT_S
 
 
+def test_a_robot_stops_by_itself_no_later_than_its_robot_file_states() -> None:
+    can, ros2, mavlink = (load_robot_config(ROBOTS[f"carter-{name}"].file) for name in ("can", "ros2", "mavlink"))
+    assert can.can is not None and ros2.ros2 is not None and mavlink.mavlink is not None
+    assert 1000 * ROBOTS["carter-can"].own_timeout_s <= can.can.command.base_timeout_ms
+    assert 1000 * ROBOTS["carter-ros2"].own_timeout_s <= ros2.ros2.base_timeout_ms
+    assert ROBOTS["carter-mavlink"].own_timeout_s <= mavlink.mavlink.setpoint_loss_max_s
+
+
 def test_a_resumed_call_reads_the_rows_that_it_had_written(tmp_path: Path) -> None:
     one = RowResult(rows()[0], [Sample(100.0, 1.0), Sample(None, 0.0, ["wrong"])], 1, 7.5)
     (tmp_path / "faults.json").write_text(json.dumps(result([one], {}, "go2")))
@@ -138,6 +148,17 @@ def test_a_resumed_call_reads_the_rows_that_it_had_written(tmp_path: Path) -> No
     (tmp_path / "faults.json").write_text("[]")
     with pytest.raises(ValueError, match="leave out --resume"):
         read_results(tmp_path / "faults.json", rows())
+
+
+def test_a_resumed_row_makes_only_the_missing_injections(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[int] = []
+    monkeypatch.setattr(command, "attempt", lambda *_: made.append(1) or Sample(50.0, 0.0))
+    counts: list[int] = []
+    kept = RowResult(row(), [Sample(100.0, 0.0)] * 3, 1)
+    arguments: tuple[Any, ...] = (None, row(), 5, random.Random(0), None)
+    done = command.run_row(*arguments, kept=kept, keep=lambda one: counts.append(len(one.samples)))
+    assert len(made) == 2 and counts == [4, 5] and len(done.samples) == 5 and done.repeated == 1
+    assert len(command.run_row(*arguments, kept=done).samples) == 5 and len(made) == 2
 
 
 def test_the_table_has_a_row_for_each_fault_and_a_column_for_each_robot() -> None:

@@ -14,7 +14,7 @@ import random
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -74,7 +74,9 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--contract", action="store_true", help="only the rows of the table of backends and faults, all N times"
     )
-    p.add_argument("--resume", action="store_true", help="keep the rows that --out already has in full")
+    p.add_argument(
+        "--resume", action="store_true", help="keep the injections that --out already has, and make the missing ones"
+    )
     p.add_argument(
         "--table", nargs="+", type=Path, metavar="DIR", help="print the results in these folders as a table, and exit"
     )
@@ -99,11 +101,24 @@ def count(row: Row, per_row: int) -> int:
     return max(1, round(row.share * per_row))
 
 
-def run_row(rig: Rig, row: Row, times: int, rng: random.Random, host: HostStall) -> RowResult:
-    """Make all injections of one row. Raises FaultError if the robot's side does not answer."""
-    samples: list[Sample] = []
-    repeated = 0
-    for index in range(times):
+def run_row(
+    rig: Rig,
+    row: Row,
+    times: int,
+    rng: random.Random,
+    host: HostStall,
+    *,
+    kept: RowResult | None = None,
+    keep: Callable[[RowResult], None] = lambda result: None,
+) -> RowResult:
+    """Make all injections of one row. Raises FaultError if the robot's side does not answer.
+
+    `kept`: the row's result of an earlier call, which counts; `keep` takes the result after every injection.
+    """
+    samples = [] if kept is None else list(kept.samples)
+    repeated = 0 if kept is None else kept.repeated
+    done = RowResult(row, samples, repeated, 0.0 if kept is None else kept.load)
+    for index in range(len(samples), times):
         sample = attempt(rig, row, rng, host)
         _show(row, f"{index + 1}/{times}", sample)
         if sample.hindered:
@@ -114,7 +129,9 @@ def run_row(rig: Rig, row: Row, times: int, rng: random.Random, host: HostStall)
             _show(row, f"{index + 1}/{times} again", sample)
             sample.wrong += sample.hindered
         samples.append(sample)
-    return RowResult(row, samples, repeated, round(os.getloadavg()[0], 1))
+        done = RowResult(row, samples, repeated, round(os.getloadavg()[0], 1))
+        keep(done)
+    return done
 
 
 def attempt(rig: Rig, row: Row, rng: random.Random, host: HostStall) -> Sample:
@@ -143,9 +160,12 @@ def run(args: argparse.Namespace, wanted: Sequence[Row]) -> list[RowResult]:
     Raises StepError if no flight could be recorded, FaultError if edge-hil does not answer.
     """
     robot, file = ROBOTS[args.robot], args.out / "faults.json"
-    kept = read_results(file, rows(robot)) if args.resume else []
-    results = [one for one in kept if len(one.samples) >= count(one.row, args.per_row)]
-    done = {one.row.name for one in results}
+    results = {one.row.name: one for one in (read_results(file, rows(robot)) if args.resume else [])}
+
+    def keep(one: RowResult) -> None:
+        results[one.row.name] = one
+        write_result(str(file), result(list(results.values()), machine_facts(), robot.name))
+
     with ExitStack() as stack:
         folder = stack.enter_context(socket_dir())
         refusal = space_refusal(folder / "flight.mcap")
@@ -158,10 +178,8 @@ def run(args: argparse.Namespace, wanted: Sequence[Row]) -> list[RowResult]:
         rig.start()
         rng = random.Random(args.seed)
         for row in wanted:
-            if row.name not in done:
-                results.append(run_row(rig, row, count(row, args.per_row), rng, host))
-                write_result(str(file), result(results, machine_facts(), robot.name))
-    return results
+            run_row(rig, row, count(row, args.per_row), rng, host, kept=results.get(row.name), keep=keep)
+    return list(results.values())
 
 
 def keep_logs(folder: Path, out: Path) -> None:

@@ -21,6 +21,7 @@ from reporting.page import Cell, Figure, Table, mark, render
 from reporting.plot_style import delay_histogram
 from tools.report import figures
 from tools.report.checks import Check, acceptance
+from tools.report.explain_page import explained_run
 from tools.report.numbers import Number, command_latency_ms, delay_at_call, headline, numbers
 from tools.report.run_data import (
     MISSHAPEN,
@@ -136,6 +137,7 @@ def _page(data: RunData, checks: Sequence[Check], wall_s: float) -> str:
         tiles=headline(data),
         maps=maps,
         cards=_cards(data),
+        events=explained_run(data),
         time_line=Figure(
             figures.time_line(data),
             "Time line of delay, forward speed and turn rate",

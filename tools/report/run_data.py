@@ -62,6 +62,8 @@ class Trace:
     """[n, 3] forward and leftward speed in the body frame (m/s) and yaw rate (rad/s)."""
     people: list[Array]
     """One [people, 3] array of x, y (m), heading (rad) per record."""
+    people_ns: NDArray[np.int64]
+    """[n] stamps of those records."""
     wire: list[Record]
     end: Record
 
@@ -174,6 +176,7 @@ def _trace(by_kind: dict[str, list[Record]]) -> Trace:
         pose_ns=np.array([p["t_ns"] for p in poses], np.int64),
         pose=np.column_stack([[float(p["x"]) for p in poses], [float(p["y"]) for p in poses], theta]),
         velocity=_body_velocity(poses, theta),
+        people_ns=np.array([p["t_ns"] for p in by_kind["people"]], np.int64),
         people=[np.asarray(p["poses"], float).reshape(-1, 3) for p in by_kind["people"]],
         wire=by_kind["wire"],
         end=by_kind["end"][-1] if by_kind["end"] else {},

@@ -8,17 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from edge.core.geometry import SE2
+from edge.flightlog.explain.chain import drift, generation_of, people_in_view
 from edge.flightlog.explain.events import FALL, TIMEOUT, Event, find_events
 from edge.flightlog.explain.flight import Flight
-from edge.flightlog.explain.verdict import (
-    Verdict,
-    decisive,
-    drift,
-    generation_of,
-    judge,
-    people_in_view,
-    window,
-)
+from edge.flightlog.explain.verdict import Verdict, decisive, judge, window
 from edge.flightlog.replay.records import RecordedTick
 from edge.state.reasoning_text import parse_waypoints
 

@@ -9,10 +9,10 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
+from edge.flightlog.explain.chain import generation_of
 from edge.flightlog.explain.explanation import Explanation
 from edge.flightlog.explain.flight import Flight
 from edge.flightlog.explain.overlay import Overlay, Picture, label
-from edge.flightlog.explain.verdict import generation_of
 from edge.flightlog.replay.records import RecordedFrame, read_events
 
 CARD_PX: Final = 480
@@ -54,7 +54,7 @@ def card(flight: Flight, each: Explanation, pictures: Mapping[int, Picture], *, 
 
 
 def contact_sheet(tiles: Sequence[tuple[Picture, str, str]]) -> bytes | None:
-    """Return pictures with two lines of text each, four to a row, as PNG; None without a picture."""
+    """Return pictures with two lines of text each, four to a row, as JPEG; None without a picture."""
     if not tiles:
         return None
     cells = [_tile(*tile) for tile in tiles]
@@ -64,7 +64,7 @@ def contact_sheet(tiles: Sequence[tuple[Picture, str, str]]) -> bytes | None:
     for at in range(0, len(cells), _COLUMNS):
         row = [_padded(cell, blank) for cell in cells[at : at + _COLUMNS]]
         rows.append(np.hstack([*row, *[blank] * (_COLUMNS - len(row))]))
-    return bytes(cv2.imencode(".png", np.vstack(rows))[1].tobytes())
+    return jpeg(np.vstack(rows))
 
 
 def jpeg(picture: Picture) -> bytes:

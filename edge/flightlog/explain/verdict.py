@@ -12,9 +12,18 @@ from dataclasses import dataclass
 from typing import Final
 
 from edge.core.geometry import SE2, wrap_angle
+from edge.flightlog.explain.chain import (
+    NEAR_M,
+    drift,
+    generation_of,
+    leading_waypoint,
+    people_in_view,
+    waypoint_at,
+)
 from edge.flightlog.explain.events import COLLISION, DETOUR, FALL, STOP, Event
-from edge.flightlog.explain.flight import Flight, Truth, bearing_rad
+from edge.flightlog.explain.flight import Flight, bearing_rad
 from edge.flightlog.replay.records import RecordedGeneration, RecordedTick
+from edge.motion.recovery import ARRIVED as HELD_AT_STOP
 from edge.state.reasoning_text import LEFT, RIGHT, Stop, Turn, TurnBack, parse_text, parse_waypoints
 
 ODOMETRY: Final = "odometry"
@@ -24,8 +33,9 @@ EXPERT: Final = "action expert"
 LIMITED: Final = "command limited"
 EXECUTION: Final = "execution"
 PERSON: Final = "person"
+ARRIVED: Final = "arrived"
 UNEXPLAINED: Final = "unexplained"
-CAUSES: Final = (ODOMETRY, REASONING, LATE, EXPERT, LIMITED, EXECUTION, PERSON, UNEXPLAINED)
+CAUSES: Final = (ODOMETRY, REASONING, LATE, EXPERT, LIMITED, EXECUTION, PERSON, ARRIVED, UNEXPLAINED)
 """Causes, in the order of the chain from the robot's pose to its motion."""
 
 DRIFT_M: Final = 0.5
@@ -36,12 +46,10 @@ WRONG_WAY_RAD: Final = math.radians(45)
 OFF_TEXT_RAD: Final = math.radians(45)
 OFF_TEXT_M: Final = 1.5
 """Angle and distance between the plan's end and the waypoints at its time from which on the plan disagrees."""
-NEAR_M: Final = 3.0
-"""A person this near and within the picture must be in the text, m."""
 _STRAIGHT_RAD: Final = math.radians(25)
 """Direction of the shortest path within which it goes straight on."""
-VIEW_RAD: Final = math.radians(45)
-"""Half of the picture's width, less a margin, rad (field of view 100°)."""
+GOAL_M: Final = 2.0
+"""Path to the goal beyond which a stop is not at the goal, m: the benchmark's threshold and some odometry error."""
 GOES_M: Final = 0.25
 """Distance in 1 s from which on a plan drives, m."""
 HELD_SHARE: Final = 0.3
@@ -75,10 +83,11 @@ def judge(flight: Flight, event: Event) -> Verdict:
         return Verdict(UNEXPLAINED, "the log has no tick of this time")
     if event.kind == STOP:
         return _of_stop(flight, event, ticks)
+    with_person = event.kind == COLLISION and "person" in event.detail
     chain = (
         _odometry(flight, ticks[-1]),
-        _person(flight, event, ticks) if event.kind == COLLISION and "person" in event.detail else None,
-        _texts(flight, event, ticks[-1]),
+        # A route that leads elsewhere is no reason to walk into a person.
+        _person(flight, event, ticks) if with_person else _texts(flight, event, ticks[-1]),
         _plan_against_text(flight, ticks),
         _command(flight, ticks),
         _execution(flight, ticks),
@@ -99,51 +108,17 @@ def window(event: Event) -> tuple[int, int]:
 
 
 def decisive(flight: Flight, events: Sequence[Event]) -> Event | None:
-    """Return the event that cost the run its goal: the fall, else the stop or detour that took longest; None: none."""
-    if not events:
+    """Return the event that cost the run its goal: the fall, else the stop or detour that took longest.
+
+    None without an event, and for a run of a robot, whose log does not say whether the goal was reached.
+    """
+    if not events or "end" not in flight.result:
         return None
-    if events[-1].kind == FALL or str(flight.result.get("end", "")) == "reached":
+    if events[-1].kind == FALL or flight.result["end"] == "reached":
         return next((event for event in events if event.kind in (FALL, COLLISION)), None)
     costly = [event for event in events if event.kind in (STOP, DETOUR)]
     longest = max(costly, key=lambda event: event.seconds, default=None)
     return longest or next((event for event in events if event.kind == COLLISION), events[-1])
-
-
-def generation_of(flight: Flight, tick: RecordedTick) -> RecordedGeneration | None:
-    """Return the generation that drove a tick; None without one in the log."""
-    return None if tick.generation is None else flight.generations.get(tick.generation)
-
-
-def people_in_view(truth: Truth, within_m: float) -> list[tuple[float, float]]:
-    """Return distance, m, and direction, rad, of the people in the picture's field of view, the nearest first."""
-    seen = []
-    for x_m, y_m in truth.people:
-        there = truth.T_world_base.inverse() @ SE2(x_m, y_m, 0.0)
-        distance_m, direction_rad = math.hypot(there.x_m, there.y_m), bearing_rad((there.x_m, there.y_m))
-        if distance_m <= within_m and abs(direction_rad) <= VIEW_RAD:
-            seen.append((distance_m, direction_rad))
-    return sorted(seen)
-
-
-def leading_waypoint(generation: RecordedGeneration) -> tuple[float, float] | None:
-    """Return the waypoint nearest to 3 m ahead, as far as the shortest path's direction is taken; None without one."""
-    points = parse_waypoints(generation.text)
-    far = [point for point in points or () if math.hypot(*point) > 0.5]
-    return min(far, key=lambda point: abs(math.hypot(*point) - NEAR_M), default=None)
-
-
-def drift(flight: Flight, tick: RecordedTick) -> tuple[float, float] | None:
-    """Return the odometry's error since the anchor of a tick, m and rad; None without truth."""
-    generation = generation_of(flight, tick)
-    if generation is None or tick.pose is None:
-        return None
-    then, now = flight.truth_at(generation.frames_ns[-1]), flight.truth_at(tick.now_ns)
-    if then is None or now is None:
-        return None
-    true = then.T_world_base.inverse() @ now.T_world_base
-    believed = generation.anchor_pose.inverse() @ tick.pose
-    error = true.inverse() @ believed
-    return math.hypot(error.x_m, error.y_m), error.theta_rad
 
 
 def _odometry(flight: Flight, tick: RecordedTick) -> Verdict | None:
@@ -230,18 +205,6 @@ def _wrong_way(generation: RecordedGeneration, route_rad: float) -> str:
     return "the text turns to the wrong side"
 
 
-def waypoint_at(generation: RecordedGeneration, at_s: float) -> tuple[float, float] | None:
-    """Return the waypoints' position at s after the anchor, in the anchor's frame; None without or beyond them."""
-    points = parse_waypoints(generation.text)
-    if points is None or not 0 <= at_s <= 3.0 * len(points):
-        return None
-    line = ((0.0, 0.0), *points)
-    index = min(int(at_s / 3.0), len(points) - 1)
-    share = at_s / 3.0 - index
-    a, b = line[index], line[index + 1]
-    return a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1])
-
-
 def _plan_against_text(flight: Flight, ticks: Sequence[RecordedTick]) -> Verdict | None:
     """Judge the plans' ends against the waypoints at the same time, seen from the robot; most ticks must disagree."""
     judged, off, worst = 0, 0, ""
@@ -313,11 +276,25 @@ def _execution(flight: Flight, ticks: Sequence[RecordedTick]) -> Verdict | None:
 def _of_stop(flight: Flight, event: Event, ticks: Sequence[RecordedTick]) -> Verdict:
     """Judge a stop backwards: was it commanded, by whom, and did plan and text ask for it?"""
     return (
-        _execution(flight, ticks)
+        _arrival(flight, event)
+        or _execution(flight, ticks)
         or _command(flight, ticks)
         or _standing_plan(flight, ticks)
         or Verdict(UNEXPLAINED, f"the robot stood: {event.detail}", _motion(ticks))
     )
+
+
+def _arrival(flight: Flight, event: Event) -> Verdict | None:
+    """Judge a stop that was mostly held at the place where the texts mean to stop."""
+    ticks = flight.ticks_between(event.begin_ns, event.end_ns)
+    held = [tick for tick in ticks if tick.reason == HELD_AT_STOP]
+    if len(held) <= len(ticks) / 2:
+        return None
+    truth, generation = flight.route_at(event.begin_ns), generation_of(flight, held[0])
+    lines = () if generation is None else (_line(generation.text, "Progress"), _line(generation.text, "Plan"))
+    if truth is not None and truth.route_m is not None and truth.route_m > GOAL_M:
+        return Verdict(REASONING, "the text ends the route before the goal", (f"{truth.route_m:.1f} m before", *lines))
+    return Verdict(ARRIVED, "the robot stands where the texts mean to stop", lines)
 
 
 def _standing_plan(flight: Flight, ticks: Sequence[RecordedTick]) -> Verdict | None:
@@ -328,7 +305,7 @@ def _standing_plan(flight: Flight, ticks: Sequence[RecordedTick]) -> Verdict | N
         return Verdict(LIMITED, "there was no semantic state to drive by", (tick.reason,))
     if tick.rows is None:
         return Verdict(LIMITED, f"there was no plan: {tick.reason}")
-    if tick.reason not in ("ok", "arrived"):
+    if tick.reason != "ok":
         return Verdict(LIMITED, f"the robot was held: {tick.reason}", _motion(ticks))
     parts, point = parse_text(generation.text), leading_waypoint(generation)
     lines = (_line(generation.text, "Motion"), _line(generation.text, "Plan"))

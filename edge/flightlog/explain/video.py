@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, command_line, messages
+from edge.flightlog.explain.chain import generation_of
 from edge.flightlog.explain.flight import Flight, read_flight
 from edge.flightlog.explain.overlay import PLAN_COLOUR, WAYPOINT_COLOUR, Overlay, Picture, label
-from edge.flightlog.explain.verdict import generation_of
 from edge.flightlog.reader import RecordingError
 from edge.flightlog.replay.records import RecordedFrame, read_events
 

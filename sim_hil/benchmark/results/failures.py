@@ -15,7 +15,7 @@ from edge.flightlog.explain.flight import read_flight
 from edge.flightlog.explain.overlay import Picture
 from edge.flightlog.explain.pictures import card, contact_sheet, drawn_pictures, wanted_stamps
 from edge.flightlog.reader import RecordingError
-from reporting.page import Figure, Table
+from reporting.page import Table
 from sim_hil.benchmark.results.record import EpisodeResult
 from sim_hil.benchmark.results.store import FLIGHTS
 
@@ -87,13 +87,12 @@ def _general(failure: Failure) -> str:
     return because.replace(event.detail, "an object") if event.kind == "collision" else because
 
 
-def failure_sheet(found: Sequence[Failure]) -> Figure | None:
-    """Return the contact sheet: one picture at the decisive moment of each failure; None without a picture."""
+def failure_sheet(found: Sequence[Failure]) -> bytes | None:
+    """Return the contact sheet, JPEG: the picture at the decisive moment of each failure; None without a failure."""
+    nothing = np.full((216, 384, 3), 60, np.uint8)
     tiles = [
-        (each.picture if each.picture is not None else np.full((216, 384, 3), 60, np.uint8), each.result.id,
+        (nothing if each.picture is None else each.picture, each.result.id,
          f"{each.decisive.event.kind}: {each.decisive.verdict.cause}")
         for each in found
     ]  # fmt: skip
-    png = contact_sheet(tiles)
-    caption = "The decisive moment of each failed episode. Blue: the plan; orange: the text's waypoints."
-    return None if png is None else Figure(png, "Contact sheet of failures", caption, wide=True)
+    return contact_sheet(tiles)

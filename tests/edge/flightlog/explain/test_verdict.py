@@ -12,6 +12,7 @@ from edge.flightlog.explain.events import COLLISION, DETOUR, STOP, TIMEOUT, find
 from edge.flightlog.explain.explanation import deciding, explain
 from edge.flightlog.explain.flight import FaultSpan, Flight, Truth
 from edge.flightlog.explain.verdict import (
+    ARRIVED,
     EXECUTION,
     EXPERT,
     LATE,
@@ -90,6 +91,13 @@ def test_a_contact_with_a_person_asks_whether_the_picture_showed_one(
     assert only(flight, COLLISION).cause == cause
 
 
+def test_a_contact_with_a_person_whom_the_text_named_is_the_action_experts_whatever_the_route() -> None:
+    person, named = (SPEED_MPS * 9.0 + 2.0, 0.3), TEXT.replace("nobody near", "person ahead 2 m standing")
+    truths = touched("person", people=(person,), route_bearing_rad=1.5)
+    flight = flights.flight(truths=truths, texts=lambda _: named)  # type: ignore[arg-type]
+    assert only(flight, COLLISION).cause == EXPERT
+
+
 def test_a_person_who_walks_into_a_standing_robot_is_the_cause() -> None:
     def still(second: float) -> RecordedTick:
         return flights.tick(second, command=(0.0, 0.0, 0.0))
@@ -166,6 +174,21 @@ def test_a_stop_that_the_plan_makes_is_judged_by_the_text(plan: str, waypoints: 
         texts=lambda n: f"Motion: nobody near.\nPlan: {plan}.\n{waypoints}" if n >= 5 else TEXT,
     )  # fmt: skip
     assert only(flight, STOP).cause == cause
+
+
+@pytest.mark.parametrize(("route_m", "cause"), [(1.0, ARRIVED), (8.0, REASONING)])
+def test_a_stop_where_the_texts_mean_to_stop_is_judged_by_the_goal(route_m: float, cause: str) -> None:
+    flight = flights.flight(
+        ticks=lambda s: stopped(s, command=(0.0, 0.0, 0.0), reason="arrived"),
+        truths=lambda s: replace(standing_truth(s), route_m=route_m),
+    )
+    assert only(flight, STOP).cause == cause
+
+
+def test_a_robots_log_has_no_decisive_event_because_it_does_not_know_the_goal() -> None:
+    flight = flights.flight(ticks=lambda s: stopped(s, command=(0.0, 0.0, 0.0)), truths=None)
+    found = explain(flight)
+    assert found and deciding(flight, found) is None
 
 
 def test_without_truth_a_flight_knows_stops_and_loops_but_no_contacts() -> None:
