@@ -138,7 +138,7 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
     "special tokens exchanged": (exchange_special, "the prompt's token ids are not the exporter's"),
     "a negative next token": (
         lambda d: edit_graph(d, "language_model", lambda m: replace_output(m, "next_token", "Neg")),
-        r"the graphs do not run \(the language model's next token is -\d+",
+        r"the graphs do not run \(the language model's next tokens are \[-\d+",
     ),
 }  # fmt: skip
 FAST = ("one weight is NaN", "a matrix scaled by 0.99", "two tokens exchanged")
