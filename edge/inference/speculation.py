@@ -219,8 +219,8 @@ class Speculator:
         self._ends_line, self._is_number = ends_line, is_number
         self.rows = tuple(sorted(call_ns))
         """Permitted numbers of rows."""
-        # By the number of tokens, padded to the next permitted number.
-        self._call_ns = [call_ns[next_rows(self.rows, tokens)] for tokens in range(1, self.rows[-1] + 1)]
+        # By the number of tokens, padded to the next permitted number. A longer measurement of a shorter call is noise.
+        self._call_ns = [min(call_ns[rows] for rows in self.rows if rows >= n) for n in range(1, self.rows[-1] + 1)]
         # Accepted and all guesses, of other tokens and of numbers; the start is soon outweighed.
         self._counts = [[9.0, 10.0], [6.0, 10.0]]
 

@@ -25,6 +25,7 @@ from export.pipeline.report import report_html
 from export.pipeline.self_test import SELF_TEST_STAGE, known_answers, repeat_self_test
 from export.plan.plan import Plan, plan
 from export.targets.file import Target
+from firmware_bridge.system.input_file import read_json
 from reporting.progress import BuildProgress
 
 REPORT_JSON, REPORT_HTML, TOKENIZER_NAME = "report.json", "report.html", "tokenizer.json"
@@ -123,7 +124,7 @@ def _files_of(out: Path) -> dict[str, Any]:
         return dict(read_manifest(out)["files"])
     except ArtifactError:
         try:
-            older = json.loads((out / MANIFEST_NAME).read_bytes())
+            older = read_json(out / MANIFEST_NAME)
             files = dict(older["files"])
             ours = older["schema_version"] in OLDER_SCHEMAS and all(
                 file_sha256(out / name) == entry["sha256"] for name, entry in files.items()

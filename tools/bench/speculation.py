@@ -39,10 +39,10 @@ from edge.reasoning.prompt import EXAMPLE_BEFORE, EXAMPLE_PAST_PATH, Segment
 from edge.state.reasoning_text import Progress
 from edge.state.ring import EncodedFrame
 from edge.state.switches import Decoding, SwitchOptions
+from sim_hil.benchmark.arguments import choose
 from sim_hil.benchmark.env.world import EpisodeWorld, WorldOptions
 from sim_hil.benchmark.policies.artifacts_policy import ArtifactsPolicy
 from sim_hil.benchmark.policies.select import robot_config
-from sim_hil.benchmark.runs import choose
 from sim_hil.benchmark.suite.episode import Episode, SuiteError, load_suite
 from tools.bench import bad_input, command_parser
 

@@ -137,6 +137,11 @@ def test_a_call_has_a_permitted_number_of_rows() -> None:
     assert some.length([1] * 7, 7, 1, math.inf) == 3
 
 
+def test_a_short_call_that_was_measured_on_a_busy_machine_counts_as_no_longer_than_a_long_one() -> None:
+    some = speculator({2: 9.0, 4: 1.1, 8: 1.2})
+    assert some.length([1], 1, 1, 2.0) == 1 and some.length([1] * 7, 7, 1, 2.0) == 7
+
+
 @pytest.mark.parametrize("durations", [{4: 1.0}, {2: 0.0}, {2: 1.0, MOST_ROWS + 1: 1.0}])
 def test_durations_that_make_no_sense_are_refused(durations: dict[int, float]) -> None:
     with pytest.raises(ValueError, match="durations above 0"):

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from edge.state.switches import Decoding, RecoverySwitch, Speculation, Switches
-from sim_hil.benchmark.cli import conditions_of, parser
+from sim_hil.benchmark.arguments import conditions_of, parser
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError, PolicySpec
 from sim_hil.benchmark.conditions.latency import LatencyProfile
 
