@@ -253,7 +253,7 @@ TOOLS: Final = (
         {"--artifacts": texts("/nope", "/dev/null", "/dev/null/x"), "--rows": texts("nope", "\x1b[2J"),
          "--suite": toml_files,
          "--latency": numbers("-1"), "--jobs": numbers("-1", "0"), "--json": outputs}),
-    Command("tools.findings.models", "tools.findings.models", "--run {folder}/run --out {folder}/models",
+    Command("tools.findings.models", "tools.findings.models", "--run {folder}/no-run --out {folder}/models",
         {"--run": directories, "--ablations": directories, "--out": output_directories},
         says=("no run of edge-train",)),
     Command("tools.board", "tools.board.__main__",
