@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from edge.core.cli import command_line
+from firmware_bridge.system.terminal import CommandParser
 
 JOBS: Final[Mapping[str, tuple[str, str]]] = {
     "latency": ("calib.latency", "measure how long generations take beside control, for edge-bench and edge-train"),
@@ -27,7 +28,7 @@ cannot be measured, 130 interrupted
 
 def parser() -> argparse.ArgumentParser:
     """Command line of `edge-calib`; a job's own options come from its module."""
-    p = argparse.ArgumentParser(
+    p = CommandParser(
         "edge-calib", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     jobs = p.add_subparsers(dest="job", required=True, metavar="JOB")

@@ -107,6 +107,8 @@ def _check(args: argparse.Namespace) -> None:
         raise ValueError(f"--generations {args.generations}: expected {LEAST} to 100000")
     if not (math.isfinite(args.seconds) and 1 <= args.seconds <= 86_400):
         raise ValueError(f"--seconds {args.seconds:g}: expected 1 to 86400")
+    if args.scale_to_mean is not None and not (math.isfinite(args.scale_to_mean) and 0 < args.scale_to_mean <= 600):
+        raise ValueError(f"--scale-to-mean {args.scale_to_mean:g}: expected more than 0 and at most 600 s")
     check_instruction(args.instruction)
 
 

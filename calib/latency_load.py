@@ -129,7 +129,7 @@ def measure(
     language = LanguageModel(artifacts, schedule=schedule)
     language.check_instruction(instruction)
     try:
-        warm_up(policy, language, runtime.image_px, len(runtime.frame_offsets_s))
+        warm_up(policy, language, runtime.speculation)
     except (GraphError, ContextOverflowError) as error:
         raise ArtifactError(f"{artifacts.directory}: the graphs do not run ({error})") from error
     slot, found = SemanticSlot(), Generations()

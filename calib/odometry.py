@@ -343,8 +343,9 @@ def run(args: argparse.Namespace) -> int:
     check_result_target(args.json)
     if args.out is not None:
         check_result_target(str(args.out), "--out")
+    geometry = _geometry(args.robot) if args.truth is None else None
     drive = read_drive(args.log)
-    fitted = fit(drive, _references(args, drive), OdometryCalibration())
+    fitted = fit(drive, _references(args.truth, geometry, drive), OdometryCalibration())
     if fitted.good and args.out is not None:
         source = f"edge-calib odometry from {args.log.name}: {fitted.distance_m:.1f} m driven"
         write_named(args.out, calibration_text(fitted.calibration, source))
@@ -359,18 +360,21 @@ def run(args: argparse.Namespace) -> int:
     return EXIT_DONE
 
 
-def _references(args: argparse.Namespace, drive: Drive) -> list[Reference]:
-    if args.truth is not None:
-        return truth_references(args.truth, drive.reports[0].received_ns, drive.reports[-1].received_ns)
-    if args.robot is None:
-        raise LogError("expected --robot FILE.toml, whose [mount] describes how the camera sees the floor, or --truth")
-    mount = load_robot_config(args.robot).mount
-    if mount is None:
-        raise LogError(f"{args.robot}: has no [mount]: add how the camera is mounted, or give --truth")
-    geometry = CameraGeometry(
-        math.radians(mount.hfov_deg), mount.height_m, math.radians(mount.pitch_deg), mount.forward_m
-    )
+def _references(truth: Path | None, geometry: CameraGeometry | None, drive: Drive) -> list[Reference]:
+    if truth is not None:
+        return truth_references(truth, drive.reports[0].received_ns, drive.reports[-1].received_ns)
+    assert geometry is not None
     return visual_references(drive, geometry)
+
+
+def _geometry(robot: Path | None) -> CameraGeometry:
+    """Read how a robot's camera is mounted. Raises LogError or ConfigError."""
+    if robot is None:
+        raise LogError("expected --robot FILE.toml, whose [mount] describes how the camera sees the floor, or --truth")
+    mount = load_robot_config(robot).mount
+    if mount is None:
+        raise LogError(f"{robot}: has no [mount]: add how the camera is mounted, or give --truth")
+    return CameraGeometry(math.radians(mount.hfov_deg), mount.height_m, math.radians(mount.pitch_deg), mount.forward_m)
 
 
 def _table(fitted: Fit) -> str:

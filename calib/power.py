@@ -5,15 +5,9 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import datetime
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 import tomli_w
 
@@ -42,6 +36,7 @@ from export.core.typed import plain
 from export.plan.timing import measured_point
 from export.targets.file import Target, parse_target
 from export.targets.sections import Figure, Measured, TargetError
+from firmware_bridge.system.input_file import parse_toml
 
 METERS: Final = ("target", "auto", "ina3221", "nvml", "rapl", "modelled")
 
@@ -210,7 +205,7 @@ def target_text(target: Target) -> str:
     content = target.to_dict()
     content["measured"] = [{k: v for k, v in plain(point).items() if v != {}} for point in target.measured]
     text = "# Written by edge-calib power. Figures tagged measured are this device's.\n" + tomli_w.dumps(content)
-    if parse_target(tomllib.loads(text), target.name) != target:
+    if parse_target(parse_toml(text), target.name) != target:
         raise TargetError(f"{target.name}: cannot be written as a file that reads back as the same target")
     return text
 

@@ -23,6 +23,17 @@ COMMANDS: Final = {
     "edge-train": ("tools.train.cli", "train"),
 }
 """Command -> its module and the extra that it needs; `edge-bridge`, which imports nothing of `edge`, is not here."""
+ARGUMENTS: Final = {
+    "edge-export": "export.arguments",
+    "edge-hil": "sim_hil.hil.arguments",
+    "edge-bench": "sim_hil.benchmark.arguments",
+    "edge-soak": "sim_hil.soak.arguments",
+    "edge-train": "tools.train.arguments",
+}
+"""Command -> module that parses and checks its arguments without loading torch or the simulation.
+
+It has `parser()` and `check(args)`. A command that loads in less than a second is not here.
+"""
 
 
 def run(command: str) -> int:
@@ -36,7 +47,7 @@ def run(command: str) -> int:
         module, extra = replay_module(sys.argv[1:])
     if command == "edge-export" and sys.argv[1:2] == ["verify"] and importlib.util.find_spec("torch") is None:
         module = "edge.deploy.doctor.verify"
-    return run_with_extra(command, module, extra)
+    return run_with_extra(command, module, extra, ARGUMENTS.get(command, ""))
 
 
 def replay_module(arguments: list[str]) -> tuple[str, str]:

@@ -30,6 +30,7 @@ from edge.artifacts.trust import (
     write_durably,
 )
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_REFUSED, check_result_target, command_line, write_result
+from firmware_bridge.system.terminal import CommandParser, one_line
 
 EXAMPLES = """examples:
   python -m edge.signature keygen --key release.pem           # also writes release.pem.pub, which goes to the robots
@@ -44,6 +45,8 @@ def keygen(key_file: Path) -> str:
     """Write a new private key, readable by its owner alone, and `FILE.pub`; returns the key id. Never overwrites."""
     library = ed25519_library()
     form = library.serialization
+    if not key_file.name:
+        raise KeyFileError(f"--key {key_file}: expected the name of a file")
     public_file = key_file.with_name(key_file.name + ".pub")
     for path in (key_file, public_file):
         if path.exists() or path.is_symlink():
@@ -60,6 +63,8 @@ def sign(directory: Path, key_file: Path, release: int) -> str:
     """Sign a directory's manifest as a release; returns the key id. Raises ArtifactError or KeyFileError."""
     if not 0 < release <= MAX_RELEASE:
         raise KeyFileError(f"--release {release}: expected a number from 1 on that grows with every release")
+    manifest = read_manifest_bytes(directory)
+    parse_manifest(directory, manifest)  # what is damaged is not signed
     library = ed25519_library()
     try:
         key = library.serialization.load_pem_private_key(read_small(key_file), password=None)
@@ -67,8 +72,6 @@ def sign(directory: Path, key_file: Path, release: int) -> str:
         raise KeyFileError(f"{key_file}: not a PEM private key that can be read ({first_line(error)})") from error
     if not isinstance(key, library.private):
         raise KeyFileError(f"{key_file}: expected an Ed25519 private key, found {type(key).__name__}")
-    manifest = read_manifest_bytes(directory)
-    parse_manifest(directory, manifest)  # what is damaged is not signed
     key_id = key_id_of(library, key.public_key())
     signature = base64.b64encode(key.sign(signed_message(manifest, release))).decode("ascii")
     record = {"schema": SCHEMA, "key_id": key_id, "release": release, "signature": signature}
@@ -78,7 +81,7 @@ def sign(directory: Path, key_file: Path, release: int) -> str:
 
 def parser() -> argparse.ArgumentParser:
     """Command line of `python -m edge.signature`."""
-    p = argparse.ArgumentParser(
+    p = CommandParser(
         "python -m edge.signature",
         description="Sign artifacts, and check signatures as a robot does.",
         epilog=EXAMPLES,
@@ -115,10 +118,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stderr.write(f"signature: {args.command} done: {', '.join(f'{k} {v}' for k, v in result.items())}\n")
         write_result(args.json, {**result, "wall_s": round((time.monotonic_ns() - started_ns) / 1e9, 3)})
     except ArtifactError as error:
-        sys.stderr.write(f"signature: {error}\n")
+        sys.stderr.write(f"signature: {one_line(error)}\n")
         return EXIT_REFUSED
     except (KeyFileError, OSError) as error:
-        sys.stderr.write(f"signature: {error}\n")
+        sys.stderr.write(f"signature: {one_line(error)}\n")
         return EXIT_BAD_INPUT
     return EXIT_DONE
 

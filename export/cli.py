@@ -26,105 +26,30 @@ from edge.core.cli import (
     command_line,
     describe_os_error,
     named_file,
-    printable,
     write_result,
 )
+from export.arguments import COMMAND, DEFAULT_MODEL, DEFAULT_TARGET, UsageError, check, parser, target_and_config
 from export.core.cache import StageCache, default_cache_dir, open_cache
 from export.evaluation.calibration import CalibrationError, load_calibration
 from export.evaluation.gates import GateError
-from export.model.config import PRESETS, ModelConfigError, TicVlaConfig, config_for, model_settings, with_overrides
+from export.model.config import PRESETS, ModelConfigError, TicVlaConfig
 from export.model.weights import WeightsError, save_weights
 from export.pipeline.artifacts import build_artifacts, check_replaceable, verify_directory
 from export.pipeline.build import build_stages
 from export.pipeline.job import ExportRequest, Job, WeightSource, job_of
 from export.plan.plan import PlanError, plan
 from export.plan.table import plan_lines, plan_table
-from export.targets.file import Target, list_targets, load_target, with_settings
+from export.targets.file import Target, list_targets, load_target
 from export.targets.sections import TargetError
+from firmware_bridge.system.terminal import one_line
 from reporting.progress import BuildProgress, peak_rss_bytes
 
-COMMAND = "edge-export"
-DEFAULT_TARGET, DEFAULT_MODEL = "cpu", "nano"
 DEFAULT_CALIBRATION = "corridor-go2"
-EXAMPLES = """examples:
-  edge-export --target cpu --model nano --out out/nano
-  edge-export --target orin --model 1b --checkpoint InternVL3-1B/ --checkpoint action.safetensors --out out/orin
-  edge-export --target orin --model 1b --random-weights 0 --out out/orin
-  edge-export --target orin --model 1b --set power.mode=25W --dry-run
-  edge-export verify out/nano
-  edge-export --list-targets
-
-exit codes: 0 done, 1 a graph fails its gates, a plan does not fit or an artifact is damaged,
-            2 bad arguments or input, 130 interrupted (finished stages stay in the cache)
-"""
-EXPORT_ONLY = {
-    "target": "--target",
-    "model": "--model",
-    "settings": "--set",
-    "out": "--out",
-    "dry_run": "--dry-run",
-    "save_weights": "--save-weights",
-}
-"""Options that `verify` refuses, because it reads their values from the directory."""
 BAD_INPUT = (ArtifactError, CalibrationError, ModelConfigError, WeightsError, TargetError, OSError)
 
 
-class UsageError(ValueError):
-    """Missing or contradictory arguments."""
-
-
-def parser() -> argparse.ArgumentParser:
-    """Return the argument parser of `edge-export`."""
-    p = argparse.ArgumentParser(
-        COMMAND, description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    p.add_argument("command", nargs="?", choices=["verify"], help="verify DIR: check hashes, contract and gates again")
-    p.add_argument("directory", nargs="?", type=Path, metavar="DIR", help="directory for verify")
-    p.add_argument("--target", metavar="NAME|FILE.toml", help="device to export for (default: cpu)")
-    p.add_argument("--list-targets", action="store_true", help="list the targets and exit")
-    p.add_argument("--model", metavar="nano|1b|FILE.json", help="network (default: nano)")
-    p.add_argument(
-        "--checkpoint",
-        type=Path,
-        metavar="PATH",
-        action="append",
-        default=[],
-        help="weights: safetensors, .ckpt/.pt or a Hugging Face directory; repeat it for parts in several files",
-    )
-    p.add_argument(
-        "--random-weights",
-        type=int,
-        metavar="SEED",
-        help="untrained weights of this seed (default: the shipped weights, else seed 0); with --checkpoint, only for "
-        "an action expert that the checkpoint lacks",
-    )
-    p.add_argument("--save-weights", type=Path, metavar="PATH", help="also write the weights as safetensors")
-    p.add_argument("--calibration", metavar="NAME", help="calibration set, folder:PATH or video:PATH")
-    p.add_argument(
-        "--set",
-        dest="settings",
-        metavar="KEY=VALUE",
-        action="append",
-        default=[],
-        help="change the target (power.mode=25W) or the network (model.action.layers=3); repeatable",
-    )
-    p.add_argument("--out", type=Path, metavar="DIR", help="artifact directory to write")
-    p.add_argument("--dry-run", action="store_true", help="print the plan and build nothing")
-    cache = p.add_mutually_exclusive_group()
-    cache.add_argument("--cache", type=Path, metavar="DIR", help="cache of finished stages")
-    cache.add_argument("--no-cache", action="store_true", help="neither read nor write a cache")
-    p.add_argument("--cache-gb", type=float, default=20.0, metavar="GB", help="largest size of the cache (default: 20)")
-    p.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
-    return p
-
-
 def _log(line: str) -> None:
-    sys.stderr.write(f"{COMMAND}: {printable(line)}\n")
-
-
-def _target_and_config(args: argparse.Namespace) -> tuple[Target, TicVlaConfig]:
-    config = with_overrides(config_for(args.model or DEFAULT_MODEL), model_settings(args.settings))
-    return with_settings(load_target(args.target or DEFAULT_TARGET, config.name), args.settings), config
+    sys.stderr.write(f"{COMMAND}: {one_line(line)}\n")
 
 
 def _request(args: argparse.Namespace) -> ExportRequest:
@@ -151,10 +76,7 @@ def _check_plan(target: Target, config: TicVlaConfig, args: argparse.Namespace) 
 
 
 def _export(args: argparse.Namespace) -> dict[str, Any] | None:
-    if args.out is None and not args.dry_run:
-        raise UsageError("--out is missing: expected a directory to write, e.g. --out out/nano")
-    check_result_target(args.json)
-    target, config = _target_and_config(args)
+    target, config = target_and_config(args)
     _check_plan(target, config, args)
     if args.dry_run:
         return None
@@ -191,14 +113,6 @@ def _export(args: argparse.Namespace) -> dict[str, Any] | None:
 
 
 def _verify(args: argparse.Namespace) -> dict[str, Any]:
-    if args.directory is None:
-        raise UsageError("verify: the directory is missing; expected: edge-export verify DIR")
-    ignored = [option for name, option in EXPORT_ONLY.items() if getattr(args, name)]
-    if ignored:
-        raise UsageError(f"verify: {ignored[0]} has no effect on existing artifacts; leave it out")
-    if not args.directory.is_dir():
-        raise UsageError(f"verify {args.directory}: not a directory; create it with edge-export --out")
-    check_result_target(args.json)
     load_artifacts(args.directory)
     job, notes = job_of(args.directory, args.checkpoint, args.random_weights, args.calibration)
     for note in notes:
@@ -214,8 +128,6 @@ def _verify(args: argparse.Namespace) -> dict[str, Any]:
 
 @contextmanager
 def _cache(args: argparse.Namespace, beside: Path | None) -> Iterator[StageCache]:
-    if not 0 < args.cache_gb < 1e6:
-        raise UsageError(f"--cache-gb {args.cache_gb:g}: expected a size above 0")
     limit_bytes = round(args.cache_gb * 1e9)
     if args.no_cache:
         if beside is not None:
@@ -261,6 +173,7 @@ def _main(args: argparse.Namespace, started_ns: int) -> int:
             sys.stdout.write(f"{name}\t{load_target(name).description}\n")
         return EXIT_DONE
     try:
+        check(args)
         result = _verify(args) if args.command == "verify" else _export(args)
         if result is not None:
             result["peak_rss_bytes"] = peak_rss_bytes()

@@ -41,6 +41,7 @@ from firmware_bridge.system.latch_file import LatchFile, read_latch
 from firmware_bridge.system.line_log import LineLog
 from firmware_bridge.system.notify import Notifier
 from firmware_bridge.system.output_file import check_output, write_descriptor, write_output
+from firmware_bridge.system.terminal import CommandParser, one_line
 
 _OPERATORS: Final = 4  # at a time
 _OBSERVERS: Final = 4
@@ -88,16 +89,16 @@ class Bridge:
         self._open_backend = backend_opener(config)
         self._robot: Backend = AbsentRobot("")
         self._join_robot()
-        self._link = ClientLink(config.bridge.socket, group=groups.runner)
-        operators = Path(f"{config.bridge.socket}{OPERATOR_SUFFIX}")
-        self._operators = ClientLink(operators, places=_OPERATORS, group=groups.operator)
-        observers = Path(f"{config.bridge.socket}{OBSERVER_SUFFIX}")
-        self._observers = ClientLink(observers, places=_OBSERVERS, group=groups.runner)
+        with contextlib.ExitStack() as opened:  # a socket that cannot be opened leaves none of the others behind
+            self._link = ClientLink(config.bridge.socket, group=groups.runner)
+            opened.callback(self._link.close)
+            operators = Path(f"{config.bridge.socket}{OPERATOR_SUFFIX}")
+            self._operators = ClientLink(operators, places=_OPERATORS, group=groups.operator)
+            opened.callback(self._operators.close)
+            observers = Path(f"{config.bridge.socket}{OBSERVER_SUFFIX}")
+            self._observers = ClientLink(observers, places=_OBSERVERS, group=groups.runner)
+            opened.pop_all()
         self._estop_file = config.safety.estop_file
-        if not latch_path.parent.is_dir():
-            raise ConfigError(
-                f"--latch {latch_path}: expected a file in an existing folder; create {latch_path.parent}"
-            )
         latch = read_latch(latch_path)
         self._latch_file = LatchFile(latch_path, log.write)
         table = robot_table(config)
@@ -219,6 +220,19 @@ class Bridge:
             self._notifier.watchdog()
 
 
+def check_latch_path(path: Path) -> None:
+    """Check that an emergency stop can be kept at a path. Raises ConfigError."""
+    try:
+        path.lstat()
+    except FileNotFoundError:
+        if not path.parent.is_dir():
+            raise ConfigError(f"--latch {path}: expected a file in an existing folder; create {path.parent}") from None
+    except OSError as error:
+        raise ConfigError(f"--latch {path}: expected a file: {error.strerror}") from error
+    if not path.name:
+        raise ConfigError("--latch: expected the name of a file, found none")
+
+
 def is_pressed(path: Path) -> bool:
     """Whether the emergency stop behind a GPIO value file is pressed: unless the file can be read and holds 0."""
     try:
@@ -280,7 +294,7 @@ def serve(config: RobotConfig, latch_path: Path, groups: SocketGroups) -> dict[s
 
 def main(argv: list[str] | None = None) -> int:
     """Command line; see EPILOG for the exit codes."""
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="edge-bridge",
         description="The only process that commands the robot: gates velocity commands and stops the robot within"
         " 300 ms of the last good one.",
@@ -309,12 +323,14 @@ def main(argv: list[str] | None = None) -> int:
         if args.json not in (None, "-"):
             check_output(Path(args.json))
     except OSError as error:
-        sys.stderr.write(f"edge-bridge: --json {args.json!r}: expected a file or -: {error.strerror or error}\n")
+        _print(f"--json {args.json!r}: expected a file or -: {error.strerror or error}")
         return 2
     try:
         config = load_robot_config(args.robot, socket=args.socket, domain=args.domain)
         if args.command == "serve":
-            latch = args.latch or Path(f"{config.bridge.socket}.latch")
+            if args.latch is not None:
+                check_latch_path(args.latch)
+            latch = Path(f"{config.bridge.socket}.latch") if args.latch is None else args.latch
             code, result = 0, serve(config, latch, SocketGroups(args.runner_group, args.operator_group))
         else:
             from firmware_bridge.operate import operate  # never part of the process that serves
@@ -322,10 +338,10 @@ def main(argv: list[str] | None = None) -> int:
             sockets = (config.bridge.socket,) if args.socket else (SERVICE_SOCKET, config.bridge.socket)
             code, result = operate(args.command, *sockets)
     except (SocketTakenError, ConfigError, LinkOpenError) as error:
-        sys.stderr.write(f"edge-bridge: {error}\n")
+        _print(error)
         return 3 if isinstance(error, SocketTakenError) else 2
     except ModuleNotFoundError as error:
-        sys.stderr.write(f"edge-bridge: {error.name} is missing: {INSTALL[config.protocol]}\n")
+        _print(f"{error.name} is missing: {INSTALL[config.protocol]}")
         return 2
     text = json.dumps(result, indent=2) + "\n"
     try:
@@ -334,9 +350,13 @@ def main(argv: list[str] | None = None) -> int:
         elif args.json is not None:
             write_output(Path(args.json), text.encode())
     except OSError as error:
-        sys.stderr.write(f"edge-bridge: the result could not be written: {error.strerror or error}\n")
+        _print(f"the result could not be written: {error.strerror or error}")
         return 1
     return code
+
+
+def _print(message: object) -> None:
+    sys.stderr.write(f"edge-bridge: {one_line(message)}\n")
 
 
 if __name__ == "__main__":

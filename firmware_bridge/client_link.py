@@ -68,7 +68,11 @@ def listen(path: Path, group: str | None = None) -> socket.socket:
         finally:
             os.umask(umask)
         if group is not None:
-            _share(path, group)
+            try:
+                _share(path, group)
+            except BaseException:
+                path.unlink(missing_ok=True)
+                raise
     except ConfigError:
         listener.close()
         raise
@@ -105,7 +109,8 @@ def _share(path: Path, group: str) -> None:
         os.chown(path, -1, grp.getgrnam(group).gr_gid)
     except KeyError:
         raise ConfigError(
-            f"group {group}: this machine has no such group; make it first (systemd-sysusers, see edge-install units)"
+            f"group {group or repr('')}: this machine has no such group; make it first (systemd-sysusers, see"
+            " edge-install units)"
         ) from None
     except PermissionError:
         raise ConfigError(

@@ -18,6 +18,7 @@ from typing import Final
 from firmware_bridge.client import BridgeClient, BridgeUnavailable
 from firmware_bridge.core.config import OPERATOR_SUFFIX
 from firmware_bridge.core.link import BridgeStatus
+from firmware_bridge.system.terminal import one_line
 
 CONFIRM_S: Final = 1.0
 _STAND_S: Final = 2.0  # for the robot to come to rest and report it: 0.8 m/s at 1 m/s2, and half as much again
@@ -62,7 +63,7 @@ def operate(command: str, *sockets: Path) -> tuple[int, dict[str, object]]:
     if command == "arm" and any(status.permit == "not needed" for status in statuses):
         sys.stderr.write("edge-bridge: no permission is needed: the runner arms by itself\n")
     for error in hidden:
-        sys.stderr.write(f"edge-bridge: {error}\n")
+        sys.stderr.write(f"edge-bridge: {one_line(error)}\n")
     for answer in unconfirmed:
         sys.stderr.write(f"edge-bridge: {_why_unconfirmed(command, answer.status)}\n")
     values = statuses[0] if statuses else next((answer.status for answer in unconfirmed if answer.status), None)
@@ -83,7 +84,7 @@ def _why_unconfirmed(command: str, status: BridgeStatus | None) -> str:
 
 
 def _refuse(why: str) -> tuple[int, dict[str, object]]:
-    sys.stderr.write(f"edge-bridge: {why}\n")
+    sys.stderr.write(f"edge-bridge: {one_line(why)}\n")
     return 3, {"error": why}
 
 

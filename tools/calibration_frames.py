@@ -19,6 +19,7 @@ import numpy as np
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE
 from edge.core.geometry import SE2, wrap_angle
 from export.evaluation.calibration import CLIP_S, Frame
+from firmware_bridge.system.terminal import CommandParser
 from sim_hil.scene.scene import load_scene
 from sim_hil.simulation.camera import CameraWorld
 from sim_hil.simulation.physics import Simulation, SportAction
@@ -138,7 +139,7 @@ def write_set(directory: Path) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog="example:\n  python -m tools.calibration_frames --out export/evaluation/calibration_sets",

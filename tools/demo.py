@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import shutil
 import signal
 import sys
@@ -17,12 +18,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from edge.artifacts.files import MANIFEST_NAME
+from edge.artifacts.files import MANIFEST_NAME, read_manifest
 from edge.core.cli import (
     EXIT_BAD_INPUT,
     EXIT_CHECK_FAILED,
     EXIT_DONE,
     EXIT_INTERRUPTED,
+    check_result_target,
     command_line,
     messages,
     write_result,
@@ -31,6 +33,8 @@ from export.checkpoint.load import shipped_weights
 from export.model.config import PRESETS
 from export.model.weights import CheckpointError
 from firmware_bridge.core.config import ConfigError, load_robot_config
+from firmware_bridge.system.input_file import read_json
+from firmware_bridge.system.terminal import CommandParser
 from reporting.progress import Progress
 from sim_hil.realtime.children import Child, Children, StepError
 from sim_hil.realtime.robots import BRIDGE_SOCKET, GO2, ROBOTS, RunAddress, StackRobot, StackRobotError, free_domain
@@ -101,7 +105,7 @@ class DemoOptions:
 
     def _artifacts_from_out(self) -> str:
         """Return the artifacts' path, relative if inside `out`, so that the folder can be moved, else absolute."""
-        out, artifacts = self.out.resolve(), self.artifacts.resolve()
+        out, artifacts = Path(os.path.realpath(self.out)), Path(os.path.realpath(self.artifacts))
         return str(artifacts.relative_to(out) if artifacts.is_relative_to(out) else artifacts)
 
     @property
@@ -192,7 +196,7 @@ def _export(options: DemoOptions, command: Sequence[str], children: Children) ->
 def trained(artifacts: Path) -> bool:
     """Return whether the manifest records trained weights; False if it cannot be read."""
     try:
-        return json.loads((artifacts / MANIFEST_NAME).read_text(encoding="utf-8"))["model"]["trained"] is True
+        return read_json(artifacts / MANIFEST_NAME)["model"]["trained"] is True
     except (OSError, ValueError, KeyError, TypeError):
         return False
 
@@ -281,7 +285,7 @@ def _says_ready(log: Path) -> bool:
 
 def parser() -> argparse.ArgumentParser:
     """Return the argument parser."""
-    p = argparse.ArgumentParser(
+    p = CommandParser(
         "python -m tools.demo",
         description=__doc__,
         epilog=EXAMPLES,
@@ -305,6 +309,9 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]
     try:
         domain = free_domain() if args.domain is None else args.domain
         artifacts = args.artifacts or args.out / "artifacts"
+        check_result_target(args.json)
+        if artifacts.exists():
+            read_manifest(artifacts)
         options = DemoOptions(args.out, artifacts, args.duration, args.seed, args.people, domain, ROBOTS[args.robot])
         _make_folder(options.log_dir)
     except (ValueError, OSError) as error:

@@ -30,6 +30,8 @@ from edge.state.reasoning_text import WAYPOINT_TIMES_S
 
 LANGUAGE_WHOLE = ("language_model",)
 LANGUAGE_PAIR = ("language_model.prefill", "language_model.decode")
+MOST_ROWS = 16
+"""Most positions of one call whose next token a language graph chooses."""
 MAX_ELEMENTS = 1 << 31
 """Elements of a tensor's fixed axes; a larger one would be allocated before the graph is proven."""
 MAX_CACHE_BYTES = 16 << 30
@@ -296,7 +298,7 @@ def check_contract(artifacts: Artifacts) -> int:
         (vision, tokens, "float", (1, *tokens.shape[1:])),
         (first, first.input("visual_tokens"), "float", ("F", *tokens.shape[1:])),
         (first, first.input("image_offset"), "int64", (1,)),
-        (last, last.output("next_token"), "int64", (1, 1)),
+        (last, last.output("next_token"), "int64", (1, "L")),
         (context, *_guidance(artifacts)),
         (action, action.input("visual_tokens"), "float", tokens.shape),
         (action, action.input("state"), "float", (1, 3)),

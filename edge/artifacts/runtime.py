@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from edge.artifacts.files import MANIFEST_NAME, ArtifactError
-from edge.state.switches import Decoding, RecoverySwitch
+from edge.state.switches import Decoding, RecoverySwitch, Speculation, Switches
 from firmware_bridge.core.config import BRIDGE_PRIORITY
 
 RANGES: Final[Mapping[str, tuple[float, float]]] = {
@@ -37,9 +37,10 @@ SPECIAL_TOKENS: Final[Mapping[str, str]] = {
 """Setting of each special token's id, and the token."""
 SHORTEST_TEXT_TOKENS: Final = 8
 """Fewest tokens of a prompt's text, beside frames and answer; the real prompt is measured when the model is opened."""
-_SWITCHES: Final[Mapping[str, type[Decoding | RecoverySwitch]]] = {
+_SWITCHES: Final[Mapping[str, type[Decoding | RecoverySwitch | Speculation]]] = {
     "decoding": Decoding,
     "recovery": RecoverySwitch,
+    "speculation": Speculation,
 }
 _LISTS: Final = ("frame_offsets_s", "control_cores", "reasoning_cores")
 _FRACTIONS: Final = ("step_s",)
@@ -77,7 +78,13 @@ class RuntimeConfig:
     """Real-time priority of the control thread, above 0 and below the bridge's; 0: none."""
     decoding: Decoding = Decoding.CONSTRAINED
     recovery: RecoverySwitch = RecoverySwitch.ON
+    speculation: Speculation = Speculation.ON
     """Default switches, which a command's options override; older manifests lack them."""
+
+    @property
+    def switches(self) -> Switches:
+        """The default switches; standing at the goal is no setting of a manifest."""
+        return Switches(self.decoding, self.recovery, False, self.speculation)
 
     def __post_init__(self) -> None:
         for name, (least, most) in RANGES.items():

@@ -25,6 +25,7 @@ from firmware_bridge.system.output_file import (
     replace_regular,
     write_output,
 )
+from firmware_bridge.system.terminal import one_line
 
 P = ParamSpec("P")
 
@@ -49,6 +50,22 @@ def check_result_target(where: str | None, option: str = "--json") -> None:
         raise OSError(
             f"{option} {where or repr(where)}: expected a file to write or -: {error.strerror or error}"
         ) from error
+
+
+def check_result_directory(folder: Path | None, option: str = "--out") -> None:
+    """Refuse, before a long run, a folder that cannot be created or written to; raises OSError with one clear line."""
+    if folder is None:
+        return
+    try:
+        try:
+            folder.stat()
+        except FileNotFoundError:
+            check_output(folder / "result")
+            return
+        if not folder.is_dir() or not os.access(folder, os.W_OK):
+            raise NotADirectoryError(errno.ENOTDIR, "not a directory that can be written to")
+    except OSError as error:
+        raise OSError(f"{option} {folder}: expected a directory: {error.strerror or error}") from error
 
 
 def write_result(where: str | None, result: Mapping[str, Any]) -> None:
@@ -125,16 +142,11 @@ def describe_os_error(error: OSError, what: str) -> str:
     return str(error) if error.filename is not None or not error.strerror else f"{what}: {error.strerror}"
 
 
-def printable(text: str) -> str:
-    """Return text that a terminal only shows: control characters, as in a name of a file's content, are escaped."""
-    return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode("ascii") for c in text)
-
-
 def messages(name: str) -> Callable[[str], None]:
     """Return a function that writes `name: line` to standard error at once."""
 
     def write(line: str) -> None:
-        sys.stderr.write(f"{name}: {printable(line)}\n")
+        sys.stderr.write(f"{name}: {one_line(line)}\n")
         sys.stderr.flush()
 
     return write
@@ -224,13 +236,25 @@ def missing_extra(error: ModuleNotFoundError, extra: str = "") -> str | None:
     return f"needs the packages of the extra {needed!r} ({name} is missing): pip install 'tic-vla-edge[{needed}]'{also}"
 
 
-def run_with_extra(command: str, module: str, extra: str = "") -> int:
-    """Run `module.main()`; `--version` needs none of its packages, a missing extra is one line that names it."""
+def run_with_extra(command: str, module: str, extra: str = "", arguments: str = "") -> int:
+    """Run `module.main()`; `--version` needs none of its packages, a missing extra is one line that names it.
+
+    `arguments`: module that checks the command line first, because `module` takes long to load; the errors of its
+    `REFUSALS` (default: ValueError and OSError) are one line and EXIT_BAD_INPUT.
+    """
     report = messages(command)
     if sys.argv[1:] == ["--version"]:
         sys.stdout.write(f"{version_line(command)}\n")
         return EXIT_DONE
     try:
+        if arguments:
+            first = importlib.import_module(arguments)
+            if sys.argv[1:2] not in [[name] for name in getattr(first, "SUBCOMMANDS", ())]:
+                try:
+                    first.check(first.parser().parse_args())
+                except getattr(first, "REFUSALS", (ValueError, OSError)) as error:
+                    report(str(error))
+                    return EXIT_BAD_INPUT
         main = importlib.import_module(module).main
         return int(main())
     except ModuleNotFoundError as error:

@@ -16,15 +16,22 @@ import platform
 import re
 import subprocess
 import sys
-import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from email.parser import Parser
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from edge.artifacts.files import ArtifactError, read_manifest_bytes
-from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, EXIT_REFUSED, write_result
+from edge.core.cli import (
+    EXIT_BAD_INPUT,
+    EXIT_CHECK_FAILED,
+    EXIT_DONE,
+    EXIT_INTERRUPTED,
+    EXIT_REFUSED,
+    check_result_target,
+    write_result,
+)
+from edge.deploy.pins import PinsError, pinned_steps, pins_of, wheel_extras
 from edge.deploy.releases import (
     CommandError,
     Contents,
@@ -43,6 +50,7 @@ from edge.deploy.releases import (
     switch_step,
     uninstall_steps,
 )
+from firmware_bridge.system.input_file import open_regular
 
 HOME: Final = Path("/opt/tic-vla-edge")
 COMMANDS: Final = ("board", "rollback", "releases", "remove")
@@ -80,9 +88,13 @@ class Request:
     contents: Contents
     pip_options: tuple[str, ...]
     keep: int
+    pins: str | None = None
+    """Packages with hashes as a pip requirements file; None: pip chooses among those that fit."""
+    unpinned: str = ""
+    """Why there are no pins; empty with pins, and with --constraints."""
 
 
-def add_parsers(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parsers(commands: argparse._SubParsersAction[Any]) -> None:
     """Add the four sub-commands."""
     board = commands.add_parser("board", help="install or update: a new release beside the old, switched by a link")
     board.add_argument("--wheel", type=Path, required=True, metavar="FILE.whl", help="the package's wheel")
@@ -96,7 +108,12 @@ def add_parsers(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     )  # fmt: skip
     board.add_argument("--index", metavar="URL", help="package index besides pip's own, e.g. NVIDIA's for Jetson")
     board.add_argument("--wheels", type=Path, metavar="DIR", help="install from this folder of wheels, no network")
-    board.add_argument("--constraints", type=Path, metavar="FILE", help="versions to install, as pip's -c")
+    board.add_argument(
+        "--constraints",
+        type=Path,
+        metavar="FILE",
+        help="versions to install, as pip's -c (default: those in the wheel, with hashes)",
+    )
     board.add_argument(
         "--keep", type=int, default=2, metavar="N", help="releases to keep beside the current one, at least 1 (2)"
     )
@@ -121,7 +138,7 @@ def run(args: argparse.Namespace, say: Say, board: Board | None = None) -> int:
     except ArtifactError as error:
         say(str(error))
         return EXIT_REFUSED
-    except InputError as error:
+    except (InputError, PinsError) as error:
         say(str(error))
         return EXIT_BAD_INPUT
     except CommandError as error:
@@ -151,8 +168,9 @@ def _file_error(error: OSError, home: Path) -> str:
 
 def _run(args: argparse.Namespace, say: Say, board: Board) -> int:
     if args.command == "releases":
+        check_result_target(args.json)
         return _list(read_home(args.home), args.json, say)
-    request = _request(args) if args.command == "board" else None
+    request = _request(args, board) if args.command == "board" else None
     if args.dry_run:
         _, steps = _plan(args, request, board, read_home(args.home), _no_command)
         for number, step in enumerate(steps, 1):
@@ -221,10 +239,16 @@ def build_steps(home: Home, number: int, request: Request, board: Board, command
             disk.copy(file, artifacts / file.name)
 
     size_mb = sum(file.stat().st_size for file in request.files) / 1e6
+    pip += request.pip_options
+    title = f"install the newest that fit, as {request.unpinned}" if request.unpinned else "install"
+    install = [command_step(title, [*pip, wheel, *request.contents.requirements], command)]
+    if request.pins is not None:
+        pins = layout.environment(number) / "pins.txt"
+        install = pinned_steps(pins, request.pins, pip, request.wheel, request.contents.requirements, command)
     steps = [
         Step(f"copy {len(request.files)} artifacts, {size_mb:.1f} MB, to {artifacts}", copy),
         command_step("make", [board.python, "-m", "venv", str(layout.environment(number))], command),
-        command_step("install", [*pip, *request.pip_options, wheel, *request.contents.requirements], command),
+        *install,
     ]
     if "unitree" in request.contents.extras and board.machine != "x86_64":
         steps.append(command_step("get the DDS binding", [layout.program(number, "edge-install"), "dds"], command))
@@ -282,26 +306,27 @@ def _say_current(home: Home, say: Say, *, changed: bool) -> None:
     say(f"undo of everything: edge-install remove --home {home.layout.home} --dry-run, then without --dry-run")
 
 
-def _request(args: argparse.Namespace) -> Request:
+def _request(args: argparse.Namespace, board: Board) -> Request:
     """Check the arguments of `board`. Raises InputError, ArtifactError or OSError."""
     if args.extras and not _EXTRAS.fullmatch(args.extras):
         raise InputError(f"--extras {args.extras}: expected names with commas between them, e.g. cpu,unitree")
     if args.keep < 1:
         raise InputError(f"--keep {args.keep}: expected at least 1: the release to roll back to")
     extras = tuple(sorted(set(args.extras.split(",")))) if args.extras else ()
-    wheel = args.wheel.absolute()
-    unknown = sorted(set(extras) - wheel_extras(wheel))
-    if unknown:
-        raise InputError(f"--extras {unknown[0]}: {wheel.name} has no such extra")
     artifacts = args.artifacts.absolute()
     manifest = read_manifest_bytes(artifacts)
     options: list[str] = []
     if args.wheels is not None:
-        options += ["--no-index", "--find-links", str(args.wheels.resolve(strict=True))]
+        options += ["--no-index", "--find-links", _existing("--wheels", args.wheels, Path.is_dir)]
     if args.index is not None:
         options += ["--extra-index-url", args.index]
     if args.constraints is not None:
-        options += ["-c", str(args.constraints.resolve(strict=True))]
+        options += ["-c", _existing("--constraints", args.constraints, Path.is_file)]
+    wheel = args.wheel.absolute()
+    unknown = sorted(set(extras) - wheel_extras(wheel))
+    if unknown:
+        raise InputError(f"--extras {unknown[0]}: {wheel.name} has no such extra")
+    pins, unpinned = (None, "") if args.constraints else pins_of(wheel, extras, board.machine)
     return Request(
         wheel=wheel,
         artifacts=artifacts,
@@ -311,28 +336,21 @@ def _request(args: argparse.Namespace) -> Request:
         ),
         pip_options=tuple(options),
         keep=args.keep,
+        pins=pins,
+        unpinned=unpinned,
     )
 
 
-def wheel_extras(wheel: Path) -> frozenset[str]:
-    """Return the extras of this package's wheel. Raises InputError for another file, or for a part of one."""
-    try:
-        with zipfile.ZipFile(wheel) as archive:
-            broken = archive.testzip()
-            names = [name for name in archive.namelist() if name.endswith(".dist-info/METADATA")]
-            if broken is not None or not names:
-                raise InputError(f"{wheel}: not a whole wheel ({broken or 'no METADATA'}); copy it again")
-            metadata = Parser().parsestr(archive.read(names[0]).decode())
-    except (zipfile.BadZipFile, EOFError) as error:
-        raise InputError(f"{wheel}: not a whole wheel ({error}); copy it again") from error
-    if metadata["Name"] != "tic-vla-edge":
-        raise InputError(f"{wheel}: expected a wheel of tic-vla-edge, found {metadata['Name']}")
-    return frozenset(metadata.get_all("Provides-Extra") or ())
+def _existing(option: str, path: Path, is_right: Callable[[Path], bool]) -> str:
+    """Return a path without links. Raises InputError for another kind of file, or none."""
+    if not is_right(path):
+        raise InputError(f"{option} {path}: expected a {'folder' if is_right is Path.is_dir else 'file'}, found none")
+    return os.path.realpath(path)
 
 
 def _digest(path: Path) -> str:
     digest = hashlib.sha256()
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         while block := file.read(_HASH_BYTES):
             digest.update(block)
     return digest.hexdigest()

@@ -9,6 +9,7 @@ Source: protocol facts, section 1.
 from __future__ import annotations
 
 import argparse
+import errno
 import hashlib
 import os
 import platform
@@ -104,6 +105,8 @@ def run(args: argparse.Namespace, say: Say, system: System | None = None, comman
 
 
 def _install(args: argparse.Namespace, say: Say, system: System, command: Run) -> int:
+    if args.archive is not None and not args.archive.is_file():
+        raise FileNotFoundError(errno.ENOENT, "expected a source archive, found no file", str(args.archive))
     code, output = command([system.python, "-c", _CHECK], {})
     if code == 0:
         say(f"cyclonedds {output.strip()} works; nothing to do")

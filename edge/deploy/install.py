@@ -20,11 +20,12 @@ from edge.core.cli import (
     messages,
     write_result,
 )
-from edge.deploy import board, dds_binding, install_units
+from edge.deploy import board, boot, dds_binding, install_units
 from edge.deploy.unit_text import UnitError
 from edge.inference import engines
 from edge.reasoning.prompt import InstructionError
 from firmware_bridge.core.config import ConfigError
+from firmware_bridge.system.terminal import CommandParser
 
 EXAMPLES = """examples:
   edge-install engines --artifacts out/orin
@@ -35,6 +36,7 @@ EXAMPLES = """examples:
   edge-install dds
   sudo edge-install board --wheel tic_vla_edge-0.1.0-py3-none-any.whl --artifacts out/cpu --extras cpu,unitree
   sudo edge-install rollback
+  sudo edge-install boot --watchdog 30 --power-mode 25W
 
 units needs a robot file with operator_arm = true in [safety], or --arm-at-start. An interrupted build of engines keeps
 the finished ones: run it again to go on.
@@ -46,7 +48,7 @@ exit codes: 0 done, 1 a step failed or systemd finds fault with the units, 2 bad
 
 def parser() -> argparse.ArgumentParser:
     """Command line of `edge-install`."""
-    p = argparse.ArgumentParser(
+    p = CommandParser(
         "edge-install", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     commands = p.add_subparsers(dest="command", required=True)
@@ -64,6 +66,9 @@ def parser() -> argparse.ArgumentParser:
     install_units.add_arguments(service)
     dds_binding.add_arguments(commands.add_parser("dds", help="install a Cyclone DDS binding that works on this board"))
     board.add_parsers(commands)
+    boot.add_arguments(
+        commands.add_parser("boot", help="set the hardware watchdog and a Jetson's power mode at start-up")
+    )
     return p
 
 
@@ -85,6 +90,8 @@ def main(
     args = parser().parse_args(argv)
     if args.command == "dds":
         return dds_binding.run(args, _print)
+    if args.command == "boot":
+        return boot.run(args, _print)
     if args.command in board.COMMANDS:
         return board.run(args, _print)
     check_result_target(args.json)

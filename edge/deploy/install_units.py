@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import shlex
 import shutil
 import socket
@@ -36,8 +37,10 @@ from edge.deploy.unit_text import (
     sysusers,
 )
 from edge.inference import engines
+from edge.reasoning.prompt import InstructionError, check_instruction
 from edge.run.instructions import check_first_instruction
 from firmware_bridge.core.config import RobotConfig, load_robot_config
+from firmware_bridge.system.input_file import read_text
 
 SYSTEM_UNITS: Final = Path("etc/systemd/system")
 SYSTEM_USERS: Final = Path("etc/sysusers.d")
@@ -191,7 +194,7 @@ def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
         )
     # A path through the link of the releases stays one, so that an update changes programs and artifacts together.
     through_link = args.home is not None and args.artifacts.absolute().is_relative_to(args.home.absolute() / LINK)
-    artifacts = load_artifacts(args.artifacts.absolute() if through_link else args.artifacts.resolve())
+    artifacts = load_artifacts(args.artifacts.absolute() if through_link else Path(os.path.realpath(args.artifacts)))
     if args.trust is not None:
         Trust(args.trust, STATE_DIRECTORY / "release.json").check(
             artifacts.directory, read_manifest_bytes(artifacts.directory)
@@ -214,16 +217,16 @@ def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
     folder = None
     if engines.needed(artifacts):
         folder = args.engines or engines.default_directory(artifacts.directory)
-        folder = folder if through_link and args.engines is None else folder.resolve()
+        folder = folder if through_link and args.engines is None else Path(os.path.realpath(folder))
     return units.ServiceInputs(
         programs=host.programs,
         python=host.python,
         prefixes=host.prefixes,
-        robot=args.robot.resolve(),
+        robot=Path(os.path.realpath(args.robot)),
         robot_files=_robot_files(robot),
         artifacts=artifacts.directory,
         engines=folder,
-        trust=None if args.trust is None else args.trust.resolve(),
+        trust=None if args.trust is None else Path(os.path.realpath(args.trust)),
         instruction=check_first_instruction(_instruction(args)),
         users=ServiceUsers(args.bridge_user, args.runner_user, args.operator_group),
         interface="" if dds is None else dds.interface,
@@ -266,11 +269,14 @@ def unreadable(paths: Sequence[Path]) -> list[Path]:
 def _instruction(args: argparse.Namespace) -> str:
     if args.instruction_file is None:
         return str(args.instruction)
-    data = args.instruction_file.read_bytes()[: _MAX_INSTRUCTION_BYTES + 1]
     try:
-        return str(data.decode("utf-8"))
+        return check_instruction(read_text(args.instruction_file, _MAX_INSTRUCTION_BYTES))
     except UnicodeDecodeError:
         raise UnitError(f"--instruction-file {args.instruction_file}: not UTF-8 text") from None
+    except InstructionError as error:
+        raise UnitError(f"--instruction-file {args.instruction_file}: {error}") from error
+    except OSError as error:
+        raise UnitError(f"--instruction-file {args.instruction_file}: {error.strerror}") from error
 
 
 def _bridge_cores(artifacts: Artifacts, facts: TargetFacts) -> tuple[int, ...]:

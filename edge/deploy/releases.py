@@ -19,6 +19,7 @@ from typing import Any, Final
 
 from edge.core.cli import write_whole
 from edge.deploy.dds_binding import explained
+from firmware_bridge.system.input_file import read_json
 
 RECORD: Final = "release.json"
 LINK: Final = "current"
@@ -191,7 +192,7 @@ def _current(layout: Layout) -> int | None:
 def _read_record(path: Path, number: int) -> Release | None:
     """Return the release of a record; None without a record that is whole."""
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = read_json(path)
         made: dict[str, Any] = found["contents"]
         contents = Contents(
             str(made["wheel"]), str(made["wheel_sha256"]), str(made["manifest_sha256"]),

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Final
 
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, command_line, messages
+from firmware_bridge.system.terminal import CommandParser
 
 KEEP_BYTES: Final = 8 * 1024**3
 """Default limit of all logs, bytes: two recordings at their own bound (edge.flightlog.recorder); our choice."""
@@ -75,7 +76,7 @@ def clean(folder: Path, keep_bytes: int, keep_runs: int = KEEP_RUNS) -> tuple[li
 
 def parser() -> argparse.ArgumentParser:
     """Command line."""
-    p = argparse.ArgumentParser(
+    p = CommandParser(
         "edge.flightlog.cleanup",
         description=__doc__,
         epilog=EXAMPLES,

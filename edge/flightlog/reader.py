@@ -16,6 +16,8 @@ from mcap.exceptions import McapError
 from mcap.records import Channel, Message
 from mcap.stream_reader import CRCValidationError, StreamReader
 
+from firmware_bridge.system.input_file import open_regular
+
 _MAGIC = b"\x89MCAP0\r\n"
 _RECORD_LIMIT_BYTES = 256 * 1024 * 1024
 
@@ -61,12 +63,15 @@ def read_messages(path: str | Path) -> Iterator[tuple[str, int, dict[str, Any]]]
 
 
 def _is_mcap(path: Path) -> bool:
-    with path.open("rb") as stream:
-        return stream.read(len(_MAGIC)) == _MAGIC
+    with open_regular(path) as stream:
+        try:
+            return stream.read(len(_MAGIC)) == _MAGIC
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(path)) from None
 
 
 def _read_part(path: Path) -> Iterator[tuple[str, int, dict[str, Any]]]:
-    with path.open("rb") as stream:
+    with open_regular(path) as stream:
         stream.seek(len(_MAGIC))
         records = StreamReader(
             stream, skip_magic=True, validate_crcs=True, record_size_limit=_RECORD_LIMIT_BYTES

@@ -35,12 +35,13 @@ def _record(title: str, optional: tuple[str, ...] = (), **properties: Schema) ->
 SCHEMAS: Mapping[str, Schema] = {
     "/run": _record(
         "tic_vla.Run",
-        ("limits", "mount", "release", "decoding", "recovery", "stand_at_goal"),
+        ("limits", "mount", "release", "decoding", "recovery", "stand_at_goal", "speculation"),
         instruction=_TEXT,
         mode=_TEXT,
         decoding=_TEXT,  # Switches: what was in force
         recovery=_TEXT,
         stand_at_goal=_BOOL,
+        speculation=_TEXT,
         artifacts=_TEXT,
         manifest_sha256=_TEXT,
         release=_INT_OR_NULL,  # counter of the artifacts' signature
@@ -94,6 +95,7 @@ SCHEMAS: Mapping[str, Schema] = {
             "planned",
             "stop",
             "max_new_tokens",
+            "decode_calls",
         ),
         generation=_INT,
         instruction=_TEXT,  # the run's, or another that was given later
@@ -117,6 +119,7 @@ SCHEMAS: Mapping[str, Schema] = {
         prompt_tokens=_INT,
         max_new_tokens=_INT,
         new_tokens=_INT,
+        decode_calls=_INT,  # calls that chose the new tokens
         text=_TEXT,
         waypoints=_ROWS_OR_NULL,
         prefill_ms=_NUMBER,

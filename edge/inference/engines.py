@@ -25,6 +25,7 @@ from edge.artifacts.manifest import Artifacts, TensorContract
 from edge.core.cli import write_whole
 from edge.core.device import OPENVINO, TENSORRT, DeviceFacts, available_providers, read_device
 from edge.inference.graph import DTYPES, Array, Graph, GraphError
+from firmware_bridge.system.input_file import read_json
 
 ENGINES_NAME = "engines.json"
 SCHEMA = 1
@@ -177,8 +178,8 @@ def _read(directory: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > MAX_BYTES:
             return {}
-        content: Any = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError):
+        content: Any = read_json(path)
+    except (OSError, ValueError):
         return {}
     if not isinstance(content, dict) or content.get("schema") != SCHEMA or not isinstance(content.get("graphs"), dict):
         return {}

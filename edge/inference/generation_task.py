@@ -145,6 +145,7 @@ class GenerationTask:
             "stop": None if stop is None else stop.as_tuple(),
             "prompt_tokens": result.generation.prompt_tokens,
             "new_tokens": result.generation.new_tokens,
+            "decode_calls": result.generation.decode_calls,
             "text": result.generation.text,
             "waypoints": result.waypoints,
         }

@@ -1,28 +1,41 @@
-"""The slow half of the model: prefill in chunks, then greedy decoding; it can stop between and within calls."""
+"""The slow half of the model: prefill in chunks, then greedy decoding; it can stop between and within calls.
+
+A decoding call verifies tokens that were guessed from the previous text (`edge.inference.speculation`).
+"""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
-import numpy.typing as npt
 import onnxruntime as ort
 from tokenizers import Tokenizer
 
 from edge.artifacts.files import ArtifactError
-from edge.artifacts.manifest import Artifacts
+from edge.artifacts.manifest import MOST_ROWS, Artifacts
 from edge.artifacts.tokenizer_file import MAX_TOKENS
 from edge.core.geometry import SE2
+from edge.inference.calls import Call, Chunk, Floats, chunks, set_first_apart, set_last_apart
 from edge.inference.graph import DTYPES, CancelledError, Graph, GraphError, Interrupt, zeros
 from edge.inference.scheduling import Schedule, run_as
+from edge.inference.speculation import FIRST_TEXT, LEAST_ROWS, Speculator, TextUnderWay, exact_calls_ns, next_rows
 from edge.reasoning.decoding_rules import DecodingContext, TextConstraint
-from edge.reasoning.prompt import LONGEST_BEFORE, LONGEST_PAST_PATH, InstructionError, PromptBuilder, PromptIds, Segment
+from edge.reasoning.prompt import (
+    EXAMPLE_BEFORE,
+    EXAMPLE_PAST_PATH,
+    LONGEST_BEFORE,
+    LONGEST_PAST_PATH,
+    InstructionError,
+    PromptBuilder,
+    PromptIds,
+    Segment,
+)
 from edge.state.reasoning_text import MAX_TEXT_CHARS
 from edge.state.ring import EncodedFrame
-
-Floats = npt.NDArray[np.float32]
 
 
 class ContextOverflowError(ValueError):
@@ -41,76 +54,17 @@ class Generation:
     prompt_tokens: int
     prefill_ms: float
     decode_ms: float
+    decode_calls: int
+    """Calls that chose the new tokens; without speculation one a token, and one for the token after them."""
+    guessed: int
+    """Guesses that were compared with the model's choice."""
+    accepted: int
+    """Guesses that the model chose."""
 
     @property
     def new_tokens(self) -> int:
         """Number of new tokens."""
         return len(self.token_ids)
-
-
-@dataclass(frozen=True)
-class Chunk:
-    """Consecutive prompt tokens that go through one call."""
-
-    ids: tuple[int, ...]
-    tokens: Floats | None
-    """Visual tokens of the frame whose placeholders are among the ids; None without a frame."""
-    image_offset: int
-    """Number of that frame's placeholders that earlier chunks have filled."""
-
-
-def chunks(segments: Sequence[Segment], *, size: int, image_id: int) -> list[Chunk]:
-    """Split segments into calls of at most `size` tokens; a frame may be split anywhere."""
-    result: list[Chunk] = []
-    for segment in segments:
-        filled = 0
-        for start in range(0, len(segment.ids), size):
-            ids = segment.ids[start : start + size]
-            places = ids.count(image_id)
-            result.append(Chunk(ids, segment.tokens if places else None, filled))
-            filled += places
-    return result
-
-
-def set_last_apart(prompt: Sequence[Chunk]) -> list[Chunk]:
-    """Return the same prompt with its last token, which is text, in a separate chunk."""
-    *head, tail = prompt
-    last = Chunk(tail.ids[-1:], None, 0)
-    return [*head, *([Chunk(tail.ids[:-1], tail.tokens, tail.image_offset)] if tail.ids[:-1] else []), last]
-
-
-class Call:
-    """One language graph bound once to KV buffers that every call extends in place."""
-
-    def __init__(self, graph: Graph, buffers: dict[str, ort.OrtValue]) -> None:
-        self._graph = graph
-        self._binding = graph.binding()
-        for name, buffer in buffers.items():
-            self._binding.bind_ortvalue_input(name, buffer)
-            self._binding.bind_ortvalue_output(name.replace("past_key_values", "present"), buffer)
-        self._next_token = np.zeros((1, 1), dtype=np.int64)
-        if any(tensor.name == "next_token" for tensor in graph.contract.outputs):
-            self._binding.bind_ortvalue_output("next_token", ort.OrtValue.ortvalue_from_numpy(self._next_token))
-        visual = next((tensor for tensor in graph.contract.inputs if tensor.name == "visual_tokens"), None)
-        self._no_frame = None if visual is None else zeros(visual, F=1)
-
-    def __call__(self, chunk: Chunk, past: int, kv: Floats, interrupt: Interrupt | None) -> int:
-        """Feed a chunk after `past` tokens, fill its rows of `kv` [1, T, kv_dim], return the id after it (0: none)."""
-        total = past + len(chunk.ids)
-        feeds: dict[str, npt.NDArray[np.generic]] = {
-            "input_ids": np.array([chunk.ids], dtype=np.int64),
-            "seqlens_k": np.array([total - 1], dtype=np.int32),
-            "total_sequence_length": np.array(total, dtype=np.int32),
-        }
-        if self._no_frame is not None:
-            feeds["visual_tokens"] = self._no_frame if chunk.tokens is None else chunk.tokens
-            feeds["image_offset"] = np.array([chunk.image_offset], dtype=np.int64)
-        for name, value in feeds.items():
-            self._binding.bind_ortvalue_input(name, ort.OrtValue.ortvalue_from_numpy(value))
-        rows = ort.OrtValue.ortvalue_from_numpy(kv[:, past:total])
-        self._binding.bind_ortvalue_output("last_layer_kv", rows)
-        self._graph.run_bound(self._binding, interrupt)
-        return int(self._next_token[0, 0])
 
 
 def _open_tokenizer(content: bytes) -> Tokenizer:
@@ -150,12 +104,12 @@ class LanguageModel:
                 for name in artifacts.language_graphs
             ],
         )
-        self._tokenizer = _open_tokenizer(artifacts.contents["tokenizer.json"])
+        self.tokenizer = _open_tokenizer(artifacts.contents["tokenizer.json"])
         self.runtime = runtime
         ids = PromptIds(
             runtime.im_start_id, runtime.im_end_id, runtime.img_start_id, runtime.img_end_id, runtime.img_context_id
         )
-        self.prompt = PromptBuilder(self._tokenizer, ids, runtime.frame_tokens)
+        self.prompt = PromptBuilder(self.tokenizer, ids, runtime.frame_tokens)
         buffers = {
             cache.name: ort.OrtValue.ortvalue_from_shape_and_type(
                 [axis if isinstance(axis, int) else runtime.max_context for axis in cache.shape],
@@ -167,9 +121,18 @@ class LanguageModel:
         }
         calls = [Call(graph, buffers) for graph in graphs]
         self.prefill_call, self.decode_call = calls[0], calls[-1]
-        self._no_frame = zeros(graphs[0].contract.input("visual_tokens"), F=1).astype(np.float32)
+        self.no_frame = zeros(graphs[0].contract.input("visual_tokens"), F=1).astype(np.float32)
         self._kv = np.zeros((1, runtime.max_context, runtime.kv_dim), dtype=np.float32)
         self._took_ns: dict[int, int] = {}
+        self._graphs, self._buffers = graphs, buffers
+        self.rows: tuple[int, ...] = (LEAST_ROWS,)
+        """Permitted numbers of rows of a call that chooses tokens, ascending."""
+        self.kept_ids: tuple[int, ...] = ()
+        """Prompt tokens before the first frame whose rows the buffers hold, from position 0."""
+        self.speculator: Speculator | None = None
+        """Guesses the next tokens; None: one new token a call."""
+        self.ends_line = cache(lambda token: self.text_of([token]).endswith("\n"))
+        """Return whether a token's text ends a line."""
 
     def check_instruction(self, instruction: str) -> None:
         """Raise InstructionError unless a prompt with all frames and a full answer fit the model's context.
@@ -177,7 +140,7 @@ class LanguageModel:
         The check uses the longest prompt: all points of a far path, and a long progress.
         """
         frames = range(len(self.runtime.frame_offsets_s))
-        filler = [EncodedFrame(i, SE2(0.0, 0.0, 0.0), self._no_frame) for i in frames]
+        filler = [EncodedFrame(i, SE2(0.0, 0.0, 0.0), self.no_frame) for i in frames]
         prompt = self.prompt.build(filler, instruction, LONGEST_PAST_PATH, LONGEST_BEFORE)
         needed = sum(len(segment.ids) for segment in prompt)
         room = self.runtime.max_context - self.runtime.max_new_tokens
@@ -188,7 +151,7 @@ class LanguageModel:
 
     def constraint(self, context: DecodingContext) -> TextConstraint:
         """Return the constraint of one generation's text by a context."""
-        return TextConstraint(context, lambda text: self._tokenizer.encode(text, add_special_tokens=False).ids)
+        return TextConstraint(context, lambda text: self.tokenizer.encode(text, add_special_tokens=False).ids)
 
     def generate(
         self,
@@ -207,22 +170,60 @@ class LanguageModel:
         *,
         interrupt: Interrupt | None = None,
         before_call: Callable[[int], None] | None = None,
+        longest_guess_ns: Callable[[], float] = lambda: math.inf,
     ) -> GenerationRun:
         """Begin a generation whose prompt is fed in parts; the previous one must be over: they share buffers.
 
-        `cancelled` is called before every call of a graph, `interrupt` can end one under way, and `before_call` takes
-        the expected duration of the next call, ns.
+        `cancelled` is called before every call of a graph, `interrupt` can end one under way, `before_call` takes
+        the expected duration of the next call, ns, and `longest_guess_ns` limits the duration of a call with guesses.
         """
-        return GenerationRun(self, cancelled, interrupt, before_call)
+        return GenerationRun(self, cancelled, interrupt, before_call, longest_guess_ns)
 
-    def run(self, call: Call, chunk: Chunk, past: int, interrupt: Interrupt | None) -> int:
-        """Feed a chunk after `past` tokens; return the next id (0 from a graph without one). Raises GraphError."""
+    def speculate(self) -> str | None:
+        """Guess tokens from now on if calls of any length give equal bits here; else return a line for the operator.
+
+        Runs an example's prompt and calls of every number of rows, whose durations it measures. Raises GraphError.
+        """
+        frames = range(len(self.runtime.frame_offsets_s))
+        rng = np.random.default_rng(0)
+        noise = [rng.standard_normal(self.no_frame.shape, dtype=np.float32) for _ in frames]
+        here = SE2(0.0, 0.0, 0.0)
+        prompt = self.prompt.build(
+            [EncodedFrame(i, here, tokens) for i, tokens in zip(frames, noise, strict=True)],
+            "stop", EXAMPLE_PAST_PATH, EXAMPLE_BEFORE,
+        )  # fmt: skip
+        first = self.tokenizer.encode(FIRST_TEXT, add_special_tokens=False).ids
+        written = self.generate(prompt, max_new_tokens=MOST_ROWS, cancelled=lambda: False)
+        call = Call(self._graphs[-1], self._buffers, with_logits=True)
+        usual = exact_calls_ns(call, self._kv, written.prompt_tokens, first[:MOST_ROWS])
+        # Attention sums over the context: check it at its full length as well, on rows that were computed.
+        end, most = self.runtime.max_context - MOST_ROWS, self.runtime.prefill_chunk_tokens
+        for start in range(written.prompt_tokens, end, most):
+            filler = (first * most)[: min(most, end - start)]
+            self.prefill_call(Chunk(tuple(filler), None, 0), start, self._kv, None)
+        full = exact_calls_ns(call, self._kv, end, first[:MOST_ROWS])
+        call_ns = {rows: min(took_ns, full[rows]) for rows, took_ns in usual.items() if rows in full}
+        if LEAST_ROWS not in call_ns:
+            self.rows = (1,)
+            return (
+                "speculation is off: on this device a token's keys and values depend on the other tokens of its call, "
+                "so guesses could change the text"
+            )
+        self._took_ns |= call_ns
+        is_number = cache(lambda token: any(character.isdigit() for character in self.text_of([token])))
+        self.speculator = Speculator(first, call_ns, self.ends_line, is_number)
+        self.rows = self.speculator.rows
+        return None
+
+    def run(self, call: Call, chunk: Chunk, past: int, interrupt: Interrupt | None) -> list[int]:
+        """Feed a chunk after `past` tokens; return what `Call` does. Raises GraphError."""
+        self.kept_ids = self.kept_ids[:past]
         started_ns = time.monotonic_ns()
-        next_id = call(chunk, past, self._kv, interrupt)
-        if not 0 <= next_id < MAX_TOKENS:
-            raise GraphError(f"the language model's next token is {next_id}, expected an id of its vocabulary")
+        next_ids = call(chunk, past, self._kv, interrupt)
+        if not all(0 <= token < MAX_TOKENS for token in next_ids):
+            raise GraphError(f"the language model's next tokens are {next_ids}, expected ids of its vocabulary")
         self._took_ns[len(chunk.ids)] = time.monotonic_ns() - started_ns
-        return next_id
+        return next_ids
 
     def expected_ns(self, tokens: int) -> int:
         """Return the duration of the last call with that many tokens, ns; 0 before the first."""
@@ -234,7 +235,7 @@ class LanguageModel:
 
     def text_of(self, ids: Sequence[int]) -> str:
         """Return the text of new tokens, cut at the grammar's longest text."""
-        return str(self._tokenizer.decode(list(ids), skip_special_tokens=True))[:MAX_TEXT_CHARS]
+        return str(self.tokenizer.decode(list(ids), skip_special_tokens=True))[:MAX_TEXT_CHARS]
 
 
 class GenerationRun:
@@ -250,7 +251,9 @@ class GenerationRun:
         cancelled: Callable[[], bool],
         interrupt: Interrupt | None,
         before_call: Callable[[int], None] | None,
+        longest_guess_ns: Callable[[], float],
     ) -> None:
+        self._longest_guess_ns = longest_guess_ns
         self._model = model
         self._cancelled = cancelled
         self._interrupt = interrupt
@@ -262,7 +265,7 @@ class GenerationRun:
         """Prefill the next part of the prompt; leave at least one segment for `finish`."""
         started_ns = time.monotonic_ns()
         for chunk in self._cut(segments):
-            self._run(self._model.prefill_call, chunk)
+            self._prefill(chunk)
         self._prefill_ns += time.monotonic_ns() - started_ns
 
     def finish(
@@ -271,61 +274,118 @@ class GenerationRun:
         """Prefill the rest of the prompt, then decode greedily within `constraint`. The last token must be text."""
         model, runtime = self._model, self._model.runtime
         started_ns = time.monotonic_ns()
-        *head, last = self._cut(segments)
-        if model.prefill_call is not model.decode_call:
-            # The prefill graph of a pair has no vocabulary projection, so the decode graph takes the last token.
-            *head, last = set_last_apart([*head, last])
+        *head, last = set_last_apart(self._cut(segments))
         for chunk in head:
-            self._run(model.prefill_call, chunk)
-        next_id = self._run(model.decode_call, last)
-        prompt_tokens = self._fed
-        prefilled_ns = time.monotonic_ns()
-        new_ids: list[int] = []
-        line_at = 0
-        room = runtime.max_context - prompt_tokens
-        while len(new_ids) < min(max_new_tokens, room):
-            next_id = next_id if constraint is None else constraint.choose(next_id)
-            if next_id == runtime.im_end_id:
-                break
-            new_ids.append(next_id)
-            if constraint is not None and model.text_of([next_id]).endswith("\n"):
-                self._constrain_line(constraint, new_ids, line_at)
-                line_at = len(new_ids)
-            next_id = self._run(model.decode_call, Chunk((new_ids[-1],), None, 0))
+            self._prefill(chunk)
+        prompt_tokens = self._fed + 1
+        # One position is left for the padding of the last call.
+        limit = min(max_new_tokens, runtime.max_context - prompt_tokens - 1)
+        speculator = model.speculator
+        text = TextUnderWay(limit, constraint, None if speculator is None else speculator.begin())
+        pending, prefilled_ns = list(last.ids), 0
+        while pending:
+            pending = self._verify(text, pending)
+            prefilled_ns = prefilled_ns or time.monotonic_ns()
+        if speculator is not None:
+            speculator.end(text.ids)
         return Generation(
-            text=model.text_of(new_ids),
+            text=model.text_of(text.ids),
             last_layer_kv=model.last_layer_kv(self._fed),
-            token_ids=tuple(new_ids),
+            token_ids=tuple(text.ids),
             prompt_tokens=prompt_tokens,
             prefill_ms=(self._prefill_ns + prefilled_ns - started_ns) / 1e6,
             decode_ms=(time.monotonic_ns() - prefilled_ns) / 1e6,
+            decode_calls=text.calls,
+            guessed=text.guessed,
+            accepted=text.accepted,
         )
 
-    def _constrain_line(self, constraint: TextConstraint, new_ids: list[int], line_at: int) -> None:
-        """Replace a complete line that the constraint does not allow, and feed the other one up to its last token."""
-        ids = new_ids[line_at:]
-        others = constraint.replace_line(self._model.text_of(ids).rstrip("\n"))
+    def _verify(self, text: TextUnderWay, pending: list[int]) -> list[int]:
+        """Feed the pending tokens and guesses, and take the choices up to the first that was not guessed.
+
+        Returns the tokens to feed next; [] at the end of the text.
+        """
+        model = self._model
+        most = model.rows[-1]
+        while len(pending) > most:
+            self._run_rows(pending[:most])
+            self._fed += most
+            pending = pending[most:]
+        speculator = model.speculator
+        guesses = [] if speculator is None else speculator.guess(text, len(pending), self._longest_guess_ns())
+        choices = self._run_rows([*pending, *guesses])[len(pending) - 1 :]
+        self._fed += len(pending)
+        text.calls += 1
+        for choice, guess in zip(choices, [*guesses, None], strict=False):
+            if len(text.ids) >= text.limit:
+                return []
+            token = choice if text.constraint is None else text.constraint.choose(choice)
+            if guess is not None and speculator is not None:
+                text.guessed += 1
+                text.accepted += guess == token
+                speculator.record(guess, accepted=guess == token)
+            if token == model.runtime.im_end_id:
+                return []
+            text.append(token)
+            if model.ends_line(token):
+                replaced = self._constrain_line(text)
+                text.line_at = len(text.ids)
+                if replaced:
+                    return replaced
+            if token != guess:
+                return [token]
+            self._fed += 1
+        raise AssertionError("the last choice has no guess")
+
+    def _constrain_line(self, text: TextUnderWay) -> list[int]:
+        """Replace a complete line that the constraint does not allow; return the tokens to feed in its place, or []."""
+        ids = text.ids[text.line_at :]
+        line = self._model.text_of(ids).rstrip("\n")
+        others = None if text.constraint is None else text.constraint.replace_line(line)
         if others is None:
-            return
+            return []
         differ = (i for i, (token, other) in enumerate(zip(ids, others, strict=False)) if token != other)
         same = next(differ, min(len(ids), len(others)) - 1)
-        new_ids[line_at:] = others
+        text.ids[text.line_at :] = others
         self._fed -= len(ids) - 1 - same
-        for token in others[same:-1]:
-            self._run(self._model.decode_call, Chunk((token,), None, 0))
+        return list(others[same:])
+
+    def _run_rows(self, ids: Sequence[int]) -> list[int]:
+        """Run the decode graph on tokens, padded to a permitted number of rows; return the id after each of them.
+
+        The caller advances `_fed`: the next call overwrites the other rows.
+        """
+        rows = next_rows(self._model.rows, len(ids))
+        padding = max(0, min(rows, self._model.runtime.max_context - self._fed) - len(ids))
+        chunk = Chunk((*ids, *[ids[-1]] * padding), None, 0)
+        return self._call(self._model.decode_call, chunk)[: len(ids)]
 
     def _cut(self, segments: Sequence[Segment]) -> list[Chunk]:
         runtime = self._model.runtime
         tokens = self._fed + sum(len(segment.ids) for segment in segments)
         if tokens > runtime.max_context:
             raise ContextOverflowError(f"prompt of {tokens} tokens, the model reads {runtime.max_context}")
-        return chunks(segments, size=runtime.prefill_chunk_tokens, image_id=runtime.img_context_id)
+        cut = chunks(segments, size=runtime.prefill_chunk_tokens, image_id=runtime.img_context_id)
+        if self._fed == 0:
+            # Instruction and system text get calls of their own, so that the next generation can keep their rows.
+            cut = [*set_first_apart(cut[0], runtime.img_context_id), *cut[1:]]
+        return cut
 
-    def _run(self, call: Call, chunk: Chunk) -> int:
+    def _prefill(self, chunk: Chunk) -> None:
+        """Feed a chunk of the prompt, unless the previous generation has left the same rows at the same positions.
+
+        Equal calls after equal rows give equal bits, so that a kept row equals a computed one.
+        """
+        model, start, end = self._model, self._fed, self._fed + len(chunk.ids)
+        if model.kept_ids[start:end] != chunk.ids:
+            self._call(model.prefill_call, chunk)
+            if chunk.tokens is None and len(model.kept_ids) == start:
+                model.kept_ids += chunk.ids
+        self._fed = end
+
+    def _call(self, call: Call, chunk: Chunk) -> list[int]:
         if self._before_call is not None:
             self._before_call(self._model.expected_ns(len(chunk.ids)))
         if self._cancelled():
             raise CancelledError
-        next_id = self._model.run(call, chunk, self._fed, self._interrupt)
-        self._fed += len(chunk.ids)
-        return next_id
+        return self._model.run(call, chunk, self._fed, self._interrupt)

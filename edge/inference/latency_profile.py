@@ -7,9 +7,7 @@ frame; and `tagged`: measured or modelled. A flight log or the result of an `edg
 
 from __future__ import annotations
 
-import json
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,11 +18,7 @@ import numpy as np
 from edge.flightlog.reader import RecordingError, read_messages
 from edge.inference.release import MAX_DELAY_S
 from edge.power.meters.meter import MEASURED, MODELLED
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from firmware_bridge.system.input_file import read_json, read_toml
 
 SCHEMA = 1
 MAX_SAMPLES = 100_000
@@ -113,16 +107,13 @@ def load_profile(path: Path) -> LatencyProfile:
     try:
         if path.suffix == ".mcap":
             return _of_flight_log(path)
-        if path.stat().st_size > MAX_BYTES:
-            raise LatencyError(f"more than {MAX_BYTES} bytes, which is no latency profile")
-        text = path.read_text(encoding="utf-8")
-        content: Any = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
+        content: Any = (read_toml if path.suffix == ".toml" else read_json)(path, MAX_BYTES)
         if isinstance(content, Mapping) and isinstance(content.get("reasoning"), Mapping):
             return _of_run(path, content["reasoning"])
         return LatencyProfile.of_json(content)
     except OSError as error:
         raise LatencyError(f"latency profile {path}: cannot be read ({error.strerror})") from error
-    except (ValueError, RecursionError) as error:  # of the parsers, and LatencyError
+    except ValueError as error:  # of the parsers, and LatencyError
         raise LatencyError(f"latency profile {path}: {error}") from error
 
 

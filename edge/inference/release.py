@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import math
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from firmware_bridge.system.input_file import read_json
 
 MAX_DELAY_S = 60.0
 
@@ -52,16 +53,16 @@ def parse_release_delay(argument: str) -> ReleaseDelay:
     """Read `--release-delay S|PROFILE.json`; raises ReleaseDelayError with one clear line."""
     try:
         return ReleaseDelay(mean_s=float(argument))
-    except ReleaseDelayError:
-        raise
+    except ReleaseDelayError as error:
+        raise ReleaseDelayError(f"release delay {argument}: {error}") from error
     except ValueError:
         pass
     path = Path(argument)
     try:
-        content: Any = json.loads(path.read_text(encoding="utf-8"))
+        content: Any = read_json(path)
     except OSError as error:
         raise ReleaseDelayError(
-            f"release delay {argument!r}: neither a number of seconds nor a file ({error})"
+            f"release delay {argument!r}: neither a number of seconds nor a file ({error.strerror})"
         ) from error
     except ValueError as error:
         raise ReleaseDelayError(f"release delay profile {path}: not JSON ({error})") from error

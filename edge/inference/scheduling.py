@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import gc
+import math
 import os
 import resource
 import threading
@@ -252,6 +253,13 @@ class TickActivity:
             return 0
         return next_ns - now_ns
 
+    def gap_ns(self, now_ns: int) -> float:
+        """Return the time between two ticks in which a call fits without a delay of the next, ns; inf without ticks."""
+        started_ns, ended_ns = self._started_ns, self._ended_ns
+        if started_ns is None or now_ns - started_ns > 2 * self._period_ns:
+            return math.inf
+        return max(0, self._period_ns - max(0, ended_ns - started_ns) - 2 * GAP_NS)
+
 
 class GiveWay:
     """Makes reasoning wait for ticks; called before every call of a graph."""
@@ -268,6 +276,10 @@ class GiveWay:
         self._sleep = sleep
         self.waited_ns = 0
         """Time waited so far."""
+
+    def gap_ns(self) -> float:
+        """Return the time between two ticks, ns: a call with guesses must fit into it."""
+        return self._activity.gap_ns(self._clock())
 
     def wait(self, needs_ns: int, cancelled: Callable[[], bool]) -> None:
         """Block until a call of `needs_ns` may start or is cancelled."""

@@ -20,8 +20,9 @@ from edge.artifacts.files import ArtifactError
 from edge.artifacts.known_answers import CHAIN, SUMS, Answer, KnownAnswers
 from edge.artifacts.manifest import LANGUAGE_PAIR, Artifacts
 from edge.core.geometry import SE2
+from edge.inference.calls import Chunk
 from edge.inference.graph import Array, GraphError
-from edge.inference.language import Chunk, ContextOverflowError, LanguageModel
+from edge.inference.language import ContextOverflowError, LanguageModel
 from edge.inference.policy import Policy
 from edge.reasoning.prompt import EXAMPLE_BEFORE, EXAMPLE_PAST_PATH
 from edge.state.reasoning_text import WAYPOINT_TIMES_S
@@ -175,13 +176,13 @@ def _language(
     image_id = language.runtime.img_context_id
     text = _text_ids(language)
     places = min(PLACEHOLDERS, language.runtime.frame_tokens)
-    start = language.run(language.prefill_call, Chunk((image_id,) * places, visual, 0), 0, None)
+    language.run(language.prefill_call, Chunk((image_id,) * places, visual, 0), 0, None)
     filled = places
     start = language.run(language.prefill_call, Chunk(text[:TEXT_TOKENS], None, 0), filled, None)
     filled += TEXT_TOKENS
-    tokens = [start] if language.prefill_call is language.decode_call else []
+    tokens = start[-1:] if language.prefill_call is language.decode_call else []
     for token in text[TEXT_TOKENS : TEXT_TOKENS + DECODED]:
-        tokens.append(language.run(language.decode_call, Chunk((token,), None, 0), filled, None))
+        tokens += language.run(language.decode_call, Chunk((token,), None, 0), filled, None)
         filled += 1
     rows = language.last_layer_kv(filled)[0]
     before, after = rows[: places + TEXT_TOKENS], rows[places + TEXT_TOKENS :]

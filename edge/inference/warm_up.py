@@ -19,10 +19,21 @@ from edge.inference.self_test import SelfTestResult, check_answers
 from edge.inference.start_guard import OPEN_S, StartGuard
 from edge.state.ring import EncodedFrame
 from edge.state.semantic import STRAIGHT_AHEAD, SemanticState
+from edge.state.switches import Speculation
 
 COLD_TICKS: Final = 5
 """Pay for first-time allocation."""
 WARM_TICKS: Final = 20
+
+
+@dataclass(frozen=True)
+class WarmUp:
+    """Outcome of a warm-up."""
+
+    tick_ms: float
+    """Median duration of warm ticks, ms (graphs only)."""
+    notes: tuple[str, ...]
+    """Lines for the operator."""
 
 
 @dataclass(frozen=True)
@@ -53,11 +64,11 @@ def open_proven(
         return Opened(policy, language, check_answers(policy, language, known), guard)
 
 
-def warm_up(policy: Policy, language: LanguageModel, image_px: int, frame_count: int) -> float:
-    """Run every graph to allocate its memory; return the median duration of warm ticks, ms (graphs only)."""
-    here = SE2(0.0, 0.0, 0.0)
-    frame = np.zeros((1, image_px, image_px, 3), dtype=np.uint8)
-    frames = [EncodedFrame(i, here, policy.encode(frame)) for i in range(frame_count)]
+def warm_up(policy: Policy, language: LanguageModel, speculation: Speculation) -> WarmUp:
+    """Run every graph to allocate its memory, and turn speculation on where it is exact. Raises GraphError."""
+    here, runtime = SE2(0.0, 0.0, 0.0), language.runtime
+    frame = np.zeros((1, runtime.image_px, runtime.image_px, 3), dtype=np.uint8)
+    frames = [EncodedFrame(i, here, policy.encode(frame)) for i in range(len(runtime.frame_offsets_s))]
     generation = language.generate(language.prompt.build(frames, "stop"), max_new_tokens=4, cancelled=lambda: False)
     context = policy.semantic_context(generation.last_layer_kv)
     semantic = SemanticState(0, 0, here, 0, generation.last_layer_kv, context, "", STRAIGHT_AHEAD)
@@ -66,7 +77,8 @@ def warm_up(policy: Policy, language: LanguageModel, image_px: int, frame_count:
         started_ns = time.monotonic_ns()
         policy.act(policy.encode(frame), (0.0, 0.0, 0.0), 0.0, here, semantic)
         took_ms.append((time.monotonic_ns() - started_ns) / 1e6)
-    return statistics.median(took_ms[COLD_TICKS:])
+    note = language.speculate() if speculation is Speculation.ON else None
+    return WarmUp(statistics.median(took_ms[COLD_TICKS:]), () if note is None else (note,))
 
 
 def check_tick(artifacts: Artifacts, tick_ms: float) -> None:

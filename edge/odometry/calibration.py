@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import math
-import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from firmware_bridge.system.input_file import read_toml
 
 
 class CalibrationError(ValueError):
@@ -53,8 +49,8 @@ class OdometryCalibration:
 def load_calibration(path: Path) -> OdometryCalibration:
     """Read a calibration file with exactly the fields' keys. Raises CalibrationError with one clear line."""
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        table = read_toml(path)
+    except (OSError, ValueError) as error:
         raise CalibrationError(f"odometry calibration {path}: cannot be read: {error}") from error
     names = [field.name for field in fields(OdometryCalibration)]
     values: dict[str, float] = {}

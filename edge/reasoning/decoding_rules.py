@@ -195,6 +195,14 @@ class LineConstraint:
         self._lines = [line for line in allowed if len(line) > self._at]
         return token
 
+    def forced(self) -> Line:
+        """Return the next tokens that `choose` will return whatever the model chooses."""
+        if self._at == 0 or not self._lines:
+            return ()
+        first, *others = (line[self._at :] for line in self._lines)
+        same = (i for i in range(len(first)) if any(line[i : i + 1] != first[i : i + 1] for line in others))
+        return first[: next(same, len(first))]
+
 
 class TextConstraint:
     """Constrains one text to a context: `choose` for every token, `replace_line` for every line."""
@@ -225,6 +233,10 @@ class TextConstraint:
     def choose(self, token: int) -> int:
         """Return the token to take where the model chooses `token`."""
         return token if self._progress_line is None else self._progress_line.choose(token)
+
+    def forced(self) -> Line:
+        """Return the next tokens that the context forces."""
+        return () if self._progress_line is None else self._progress_line.forced()
 
     def replace_line(self, line: str) -> Line | None:
         """Return the tokens, line end included, that replace a complete line; None to keep it."""

@@ -55,9 +55,8 @@ class RunOptions:
 
     def switches_for(self, artifacts: Artifacts) -> Switches:
         """Return what is in force with these artifacts; the robot stands at the goal by default. Raises ConfigError."""
-        runtime = artifacts.runtime
         try:
-            return self.switches.over(runtime.decoding, runtime.recovery, stand_at_goal=True)
+            return self.switches.over(artifacts.runtime.switches, stand_at_goal=True)
         except ValueError as error:
             raise ConfigError(f"{artifacts.directory}: {error}") from error
 

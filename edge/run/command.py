@@ -26,7 +26,6 @@ from edge.core.cli import (
     OutputError,
     check_result_target,
     command_line,
-    printable,
     write_result,
 )
 from edge.flightlog.reader import parts
@@ -40,10 +39,11 @@ from edge.run.assembly import RunOptions
 from edge.run.instructions import check_first_instruction
 from edge.run.service import operator_lines
 from edge.run.session import RunSession
-from edge.state.switches import Decoding, RecoverySwitch, SwitchOptions
+from edge.state.switches import Decoding, RecoverySwitch, Speculation, SwitchOptions
 from firmware_bridge.client import BridgeUnavailable
 from firmware_bridge.core.config import ConfigError, RobotConfig, load_robot_config
 from firmware_bridge.core.robot_state import LinkOpenError
+from firmware_bridge.system.terminal import CommandParser
 
 EXAMPLES = """examples:
   edge-run --artifacts out/nano --robot go2.toml --instruction "walk to the vending machine"
@@ -69,7 +69,7 @@ SWITCH_INTERVAL_S = 0.0005
 
 def parser() -> argparse.ArgumentParser:
     """Command line of `edge-run`."""
-    p = argparse.ArgumentParser(
+    p = CommandParser(
         "edge-run", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     p.add_argument("--artifacts", type=Path, required=True, metavar="DIR", help="directory made by edge-export")
@@ -121,6 +121,11 @@ def parser() -> argparse.ArgumentParser:
         help="off: only the plan moves the robot (default: the manifest's; usually on)",
     )
     p.add_argument(
+        "--speculation",
+        choices=[each.value for each in Speculation],
+        help="on: verify guessed tokens, faster with the same texts (default: the manifest's; usually on)",
+    )
+    p.add_argument(
         "--stay",
         action=argparse.BooleanOptionalAction,
         help="stand where the texts have placed the stop (default: with --recovery on)",
@@ -143,6 +148,7 @@ def read_options(args: argparse.Namespace) -> tuple[RobotConfig, RunOptions]:
             raise ConfigError(f"--record {there[0]}: exists; a flight log is never overwritten, name another file")
         if not args.record.parent.is_dir():
             raise ConfigError(f"--record {args.record}: there is no directory {args.record.parent}")
+        check_result_target(str(args.record), "--record")
     robot = load_robot_config(args.robot, socket=args.socket, domain=args.domain)
     options = RunOptions(
         instruction=check_first_instruction(args.instruction),
@@ -158,7 +164,7 @@ def read_options(args: argparse.Namespace) -> tuple[RobotConfig, RunOptions]:
 
 def _switches(args: argparse.Namespace) -> SwitchOptions:
     try:
-        return SwitchOptions.parse(args.decoding, args.recovery, args.stay)
+        return SwitchOptions.parse(args.decoding, args.recovery, args.stay, args.speculation)
     except ValueError as error:
         raise ConfigError(str(error)) from error
 
@@ -170,7 +176,7 @@ def main(argv: list[str] | None = None) -> int:
     lines = operator_lines("edge-run")
     try:
         sessions: list[RunSession] = []
-        code = _run(args, lambda line: lines.write(printable(line)), sessions)
+        code = _run(args, lines.write, sessions)
     finally:
         lines.close(LINES_S)
     if any(session.hung for session in sessions):

@@ -5,6 +5,7 @@ Algorithm 4 of the paper. `edge.reasoning.generation_cycle` decides; this shell 
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
@@ -251,7 +252,13 @@ class ReasoningLoop:
 
         self.busy = True
         started_ns = self._computing.begin()
-        run = self._models.language.begin(cancelled, interrupt=interrupt, before_call=before_call)
+        give_way = self._schedule.give_way
+        run = self._models.language.begin(
+            cancelled,
+            interrupt=interrupt,
+            before_call=before_call,
+            longest_guess_ns=(lambda: math.inf) if give_way is None else give_way.gap_ns,
+        )
         begun_ns = self._ring.newest_ns
         if begun_ns is None:
             raise _MissedFrameError

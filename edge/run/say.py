@@ -12,9 +12,18 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, EXIT_REFUSED, command_line
+from edge.core.cli import (
+    EXIT_BAD_INPUT,
+    EXIT_CHECK_FAILED,
+    EXIT_DONE,
+    EXIT_INTERRUPTED,
+    EXIT_REFUSED,
+    command_line,
+    messages,
+)
 from edge.run.stop_phrase import is_stop_phrase
 from firmware_bridge.core.config import OPERATOR_SUFFIX, SERVICE_SOCKET, runtime_dir
+from firmware_bridge.system.terminal import CommandParser
 
 ANSWER_S = 2.0
 STOP_ANSWER_S = 3.0  # the runner waits up to 2 s for the robot to stand still
@@ -40,6 +49,9 @@ exit codes: 0 the runner has accepted the instruction, or the bridge has confirm
             the instruction or is silent, or the stop is not confirmed: use the remote; 2 bad arguments, or no runner
             takes instructions there; 130 interrupted
 """
+
+
+_print: Final = messages("edge-say")
 
 
 class SayError(RuntimeError):
@@ -73,7 +85,7 @@ def stop_robot(path: Path, bridge: Path | None = None) -> int:
             asking: socket.socket | None = stack.enter_context(_question(path, STOP))
         except OSError as error:
             asking = None
-            sys.stderr.write(f"edge-say: {path}: no runner takes instructions there ({error.strerror or error})\n")
+            _print(f"{path}: no runner takes instructions there ({error.strerror or error})")
         code = operate(STOP, *bridges)[0] if bridges else EXIT_REFUSED
         answer = None if asking is None else _stop_answer(asking, path)
     runners = None if answer is None else Path(str(answer.get("bridge")))
@@ -91,7 +103,7 @@ def stop_robot(path: Path, bridge: Path | None = None) -> int:
         )
         return EXIT_DONE
     found = "a bridge has stopped, which need not be this runner's" if code == EXIT_DONE else "no bridge confirms it"
-    sys.stderr.write(f"edge-say: the stop is NOT confirmed: {found}; use the remote, or switch the robot off\n")
+    _print(f"the stop is NOT confirmed: {found}; use the remote, or switch the robot off")
     return EXIT_CHECK_FAILED
 
 
@@ -121,11 +133,11 @@ def _stop_answer(asking: socket.socket, path: Path) -> dict[str, Any] | None:
     try:
         answer = _answer(asking, path, STOP_ANSWER_S)
     except (SayError, OSError) as error:
-        sys.stderr.write(f"edge-say: {error}\n")
+        _print(str(error))
         return None
     if isinstance(answer, dict) and "stopped" in answer and "bridge" in answer:
         return answer
-    sys.stderr.write(f"edge-say: {path}: expected the runner to stop, found the answer {answer}\n")
+    _print(f"{path}: expected the runner to stop, found the answer {answer}")
     return None
 
 
@@ -142,7 +154,7 @@ def _is_absent(bridge: Path) -> bool:
 
 def parser() -> argparse.ArgumentParser:
     """Command line."""
-    p = argparse.ArgumentParser(
+    p = CommandParser(
         "edge-say", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     p.add_argument("text", metavar="TEXT", help="what the robot is to do, in plain words; a stop phrase stops it")
@@ -174,13 +186,13 @@ def _hand_over(path: Path, text: str) -> int:
     try:
         accepted = say(path, text)
     except SayError as error:
-        sys.stderr.write(f"edge-say: {error}\n")
+        _print(str(error))
         return EXIT_CHECK_FAILED
     except InstructionError as error:
-        sys.stderr.write(f"edge-say: {error}\n")
+        _print(str(error))
         return EXIT_BAD_INPUT
     except OSError as error:
-        sys.stderr.write(f"edge-say: {path}: expected the socket of a runner ({error.strerror or error})\n")
+        _print(f"{path}: expected the socket of a runner ({error.strerror or error})")
         return EXIT_BAD_INPUT
     sys.stdout.write(f"{accepted}\n")
     return EXIT_DONE

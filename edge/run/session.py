@@ -85,7 +85,7 @@ class RunSession:
                 f"--mode {Mode.NO_REASONING.value}: {artifacts.directory} is guided by the waypoints that reasoning "
                 f"writes; run it with {Mode.ASYNC.value} or {Mode.SYNC.value}"
             )
-        options.switches_for(artifacts)
+        switches = options.switches_for(artifacts)
         activity = TickActivity(self._period_ns)
         opened = open_proven(artifacts, schedule=self._schedule, activity=activity)
         policy, language = opened.policy, opened.language
@@ -93,10 +93,11 @@ class RunSession:
         language.check_instruction(options.instruction)
         try:
             with opened.guard.stage("warming up", WARM_UP_S):
-                tick_ms = warm_up(policy, language, runtime.image_px, len(runtime.frame_offsets_s))
+                warm = warm_up(policy, language, switches.speculation)
         except (GraphError, ContextOverflowError) as error:
             raise ArtifactError(f"{artifacts.directory}: the graphs do not run ({error})") from error
-        check_tick(artifacts, tick_ms)
+        self._lines.extend(warm.notes)
+        check_tick(artifacts, warm.tick_ms)
         self._engines = Engines(artifacts, policy, language, self._schedule, activity)
         self._stop, self._finished = threading.Event(), threading.Event()
         self._stop_requested = False

@@ -1,4 +1,4 @@
-"""Switches of this project's additions to the paper's method: the decoding rules and the recoveries.
+"""Switches of this project's additions to the paper's method: decoding rules, recoveries and speculation.
 
 A manifest's `runtime` section has a default of each; `edge-run` and `edge-bench` have an option of each that overrides
 it; results and flight logs record the values in force.
@@ -27,6 +27,13 @@ class RecoverySwitch(Enum):
     OFF = "off"
 
 
+class Speculation(Enum):
+    """Whether a call of the language model verifies guessed tokens (`edge.inference.speculation`); texts are equal."""
+
+    ON = "on"
+    OFF = "off"
+
+
 @dataclass(frozen=True)
 class Switches:
     """The values in force in one run."""
@@ -35,6 +42,7 @@ class Switches:
     recovery: RecoverySwitch = RecoverySwitch.ON
     stand_at_goal: bool = True
     """Whether the robot stands at the stop that its texts have placed; one of the recoveries."""
+    speculation: Speculation = Speculation.ON
 
     def __post_init__(self) -> None:
         if self.stand_at_goal and self.recovery is RecoverySwitch.OFF:
@@ -44,6 +52,7 @@ class Switches:
         """Return the fields as results and flight logs hold them."""
         return {
             "decoding": self.decoding.value, "recovery": self.recovery.value, "stand_at_goal": self.stand_at_goal,
+            "speculation": self.speculation.value,
         }  # fmt: skip
 
 
@@ -54,23 +63,30 @@ class SwitchOptions:
     decoding: Decoding | None = None
     recovery: RecoverySwitch | None = None
     stand_at_goal: bool | None = None
+    speculation: Speculation | None = None
 
     @staticmethod
-    def parse(decoding: str | None, recovery: str | None, stand_at_goal: bool | None) -> SwitchOptions:
+    def parse(
+        decoding: str | None, recovery: str | None, stand_at_goal: bool | None, speculation: str | None
+    ) -> SwitchOptions:
         """Return the options of a command line. Raises ValueError for values that do not exist or contradict."""
         options = SwitchOptions(
             None if decoding is None else Decoding(decoding),
             None if recovery is None else RecoverySwitch(recovery),
             stand_at_goal,
+            None if speculation is None else Speculation(speculation),
         )
-        options.over(Decoding.CONSTRAINED, options.recovery or RecoverySwitch.ON, stand_at_goal=True)
+        options.over(Switches(recovery=options.recovery or RecoverySwitch.ON, stand_at_goal=False), stand_at_goal=True)
         return options
 
-    def over(self, decoding: Decoding, recovery: RecoverySwitch, *, stand_at_goal: bool) -> Switches:
-        """Return the values in force over these defaults; without recovery the robot stands at no goal by default.
+    def over(self, defaults: Switches, *, stand_at_goal: bool) -> Switches:
+        """Return the values in force over a manifest's defaults, and over the command's own for standing at the goal.
 
-        Raises ValueError when the options ask for standing at the goal without recovery.
+        Without recovery the robot stands at no goal by default. Raises ValueError when the options ask for standing at
+        the goal without recovery.
         """
-        recovery = self.recovery or recovery
+        recovery = self.recovery or defaults.recovery
         stands = stand_at_goal and recovery is RecoverySwitch.ON if self.stand_at_goal is None else self.stand_at_goal
-        return Switches(self.decoding or decoding, recovery, stands)
+        return Switches(
+            self.decoding or defaults.decoding, recovery, stands, self.speculation or defaults.speculation
+        )  # fmt: skip

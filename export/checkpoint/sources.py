@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from export.model.weights import CheckpointError
+from firmware_bridge.system.input_file import parse_json, read_bytes
 
 SAFETENSORS = "model.safetensors"
 INDEX = "model.safetensors.index.json"
@@ -125,12 +126,8 @@ def read_json(directory: Path, name: str) -> dict[str, Any]:
     """Read a JSON object of a downloaded directory. Raises CheckpointError."""
     path = inside(directory, name)
     try:
-        if path.stat().st_size > MAX_INDEX_BYTES:
-            raise CheckpointError(f"{path}: {path.stat().st_size} bytes, expected at most {MAX_INDEX_BYTES}")
-        content = json.loads(path.read_bytes())
-    except CheckpointError:
-        raise
-    except (OSError, ValueError, RecursionError) as error:
+        content = parse_json(read_bytes(path, MAX_INDEX_BYTES))
+    except (OSError, ValueError) as error:
         raise CheckpointError(f"{path}: not readable JSON ({error})") from error
     if not isinstance(content, dict):
         raise CheckpointError(f"{path}: a JSON {type(content).__name__}, expected an object")

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from edge.core.cli import write_whole
+from firmware_bridge.system.input_file import read_json
 
 ENTRY_NAME = "entry.json"
 RESULT_NAME = "result.json"
@@ -204,7 +205,7 @@ class StageCache:
             (directory / RESULT_NAME).write_text(text, encoding="utf-8")
 
         entry, cached = self.fetch_or_build(key, build)
-        content: dict[str, Any] = json.loads((entry / RESULT_NAME).read_text(encoding="utf-8"))
+        content: dict[str, Any] = read_json(entry / RESULT_NAME)
         return content, cached
 
     def timings(self, run: str) -> dict[str, float]:
@@ -221,7 +222,7 @@ class StageCache:
 
     def _all_timings(self) -> dict[str, Any]:
         try:
-            content = json.loads((self.directory / _TIMINGS_NAME).read_text(encoding="utf-8"))
+            content = read_json(self.directory / _TIMINGS_NAME)
         except (OSError, ValueError):
             return {}  # absent or damaged: a missing estimate is no error
         return content if isinstance(content, dict) else {}
@@ -263,7 +264,7 @@ def _seal(directory: Path) -> None:
 def _damage(entry: Path) -> str | None:
     """Return what is damaged in an entry; None if its files are exactly those recorded."""
     try:
-        files = json.loads((entry / ENTRY_NAME).read_text(encoding="utf-8"))["files"]
+        files = read_json(entry / ENTRY_NAME)["files"]
         found = sorted(path.name for path in entry.iterdir() if path.name != ENTRY_NAME)
         if found != sorted(files):
             return f"{entry.name[:12]}… holds {found}, recorded were {sorted(files)}"

@@ -18,7 +18,8 @@ import numpy.typing as npt
 
 from edge.core.geometry import SE2
 from edge.reasoning.prompt import InstructionError, check_instruction
-from export.core.typed import FieldError, build, tomllib
+from export.core.typed import FieldError, build
+from firmware_bridge.system.input_file import parse_toml
 
 Picture = npt.NDArray[np.uint8]
 
@@ -143,11 +144,11 @@ def read_set(directory: Path) -> CalibrationSet:
     where = f"calibration set {directory.name}"
     try:
         contents = {path.name: path.read_bytes() for path in sorted(directory.iterdir())}
-        listing = build(_SetFile, tomllib.loads(contents["set.toml"].decode("utf-8")), where)
-    except (OSError, KeyError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise CalibrationError(f"{where}: set.toml cannot be read ({error})") from error
+        listing = build(_SetFile, parse_toml(contents["set.toml"].decode("utf-8")), where)
     except FieldError as error:
         raise CalibrationError(str(error)) from error
+    except (OSError, KeyError, ValueError) as error:
+        raise CalibrationError(f"{where}: set.toml cannot be read ({error})") from error
     if listing.schema != 1 or listing.name != directory.name or not listing.clips:
         raise CalibrationError(f"{where}: expected schema 1, the directory's name and a list of clips")
     clips = []

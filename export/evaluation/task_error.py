@@ -88,10 +88,10 @@ class TorchStages:
                 return _array(language.hidden_states(ids, visual, empty_past(self.model))[2]), ()
             next_id, _, kv, *past = language(ids, visual, empty_past(self.model))
             found: list[int] = []
-            while len(found) < new_tokens and int(next_id) != end:
-                found.append(int(next_id))
+            while len(found) < new_tokens and int(next_id[0, -1]) != end:
+                found.append(int(next_id[0, -1]))
                 if len(found) < new_tokens:
-                    next_id, _, _, *past = language(next_id, visual[:1], past)
+                    next_id, _, _, *past = language(next_id[:, -1:], visual[:1], past)
         return _array(kv), tuple(found)
 
     def context(self, guidance: Floats) -> tuple[Floats, Floats]:

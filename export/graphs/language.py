@@ -2,7 +2,8 @@
 
 `language_model` computes prefill and decode in one precision. The pair `language_model.prefill` (fills the buffers,
 without vocabulary projection) and `language_model.decode` (reads text only) uses two precisions over the same buffers;
-decode reads the prompt's last token and returns the first new one.
+decode reads the prompt's last token and returns the first new one. A graph that chooses tokens does so after each of a
+call's last `MOST_ROWS` positions, so that one call can verify guesses (`edge.inference.speculation`).
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 from onnx import TensorProto
 from torch import nn
 
+from edge.artifacts.manifest import MOST_ROWS
 from export.graphs.vision import array, fold_tokens, layer_norm
 from export.graphs.writer import Array, GraphWriter
 from export.model.language import DecoderLayer, LanguageModel
@@ -37,6 +39,8 @@ ROLES = {
 }
 EMBEDDING_FILE = "language_model.embed.{}.onnx.data"
 """File of a large token table, which both graphs of a pair share."""
+SCORED = "L"
+"""Free axis of the scored positions: the last `MOST_ROWS` of a call, or all of a shorter one."""
 CAPACITY = "C"
 """Free axis of the KV buffers: their capacity, not the number of stored tokens."""
 
@@ -75,8 +79,8 @@ def write_language(
         if role.token:
             assert delta is not None
             _next_token(g, language, x, delta)
-            g.output("next_token", TensorProto.INT64, (1, 1))
-            g.output("logits", TensorProto.FLOAT, (1, c.vocab))
+            g.output("next_token", TensorProto.INT64, (1, SCORED))
+            g.output("logits", TensorProto.FLOAT, (SCORED, c.vocab))
         for n in cache_names(c.layers, "present"):
             g.output(n, g.float_type, shape)
         return g.finish()
@@ -205,12 +209,14 @@ def _last_layer_kv(g: GraphWriter, last: int, position: _Position, width: int) -
 
 
 def _next_token(g: GraphWriter, language: LanguageModel, x: str, delta: str) -> None:
-    """Write the greedy choice; only the last position is projected onto the vocabulary."""
+    """Write the greedy choice after each of the last positions; only these are projected onto the vocabulary."""
     c = language.config
     last = [
-        g.op("Slice", [t, g.constant([-1]), g.constant([np.iinfo(np.int64).max]), g.constant([1])]) for t in (x, delta)
+        g.op("Slice", [t, g.constant([-MOST_ROWS]), g.constant([np.iinfo(np.int64).max]), g.constant([1])])
+        for t in (x, delta)
     ]
     h, _ = _norm(g, last[0], last[1], g.floats(array(language.norm.weight), "norm"), c.rms_eps)
-    h = g.op("Reshape", [h, g.constant([1, c.hidden])])
+    h = g.op("Reshape", [h, g.constant([-1, c.hidden])])
     logits = g.to_float32(g.linear(h, "lm_head", array(language.lm_head.weight), None), "logits")
-    g.op("ArgMax", [logits], out="next_token", axis=-1, keepdims=1)
+    chosen = g.op("ArgMax", [logits], axis=-1, keepdims=0)
+    g.op("Unsqueeze", [chosen, g.constant([0])], out="next_token")

@@ -6,7 +6,6 @@ A network is named by a preset, a JSON file or `section.field=value` overrides.
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 
 from edge.state.reasoning_text import WAYPOINT_TIMES_S
 from export.core.typed import FieldError, SettingText, build, field_types, near
+from firmware_bridge.system.input_file import read_json
 
 SEMANTIC_INTERFACES = ("kv", "values-only", "waypoints")
 """Part of a generation that the action expert receives: last-layer K‖V, V alone, or waypoints (paper Table 2)."""
@@ -286,14 +286,10 @@ def config_for(model: str) -> TicVlaConfig:
 def config_from_file(path: Path) -> TicVlaConfig:
     """Read a TicVlaConfig in its `to_dict` form (absent fields keep their defaults); raises ModelConfigError."""
     try:
-        if path.stat().st_size > MAX_CONFIG_BYTES:
-            raise ModelConfigError(f"{path}: {path.stat().st_size} bytes, expected a model configuration in JSON")
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path, MAX_CONFIG_BYTES)
     except OSError as error:
         raise ModelConfigError(f"{path}: cannot be read ({error.strerror})") from error
-    except ModelConfigError:
-        raise
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise ModelConfigError(f"{path}: not JSON ({error})") from error
     return config_from_dict(content, str(path))
 

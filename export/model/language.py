@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 
+from edge.artifacts.manifest import MOST_ROWS
 from export.model.attention import TypedModuleList
 from export.model.config import LanguageConfig
 from export.model.vision import fold_tokens
@@ -122,7 +123,10 @@ class LanguageModel(nn.Module):
     def forward(
         self, input_ids: Tensor, visual_tokens: Tensor, past: list[Tensor], image_offset: int = 0
     ) -> tuple[Tensor, ...]:
-        """Compute `next_token` [1, 1], last `logits` [1, vocab], `last_layer_kv` [1, S, kv_dim] and caches."""
+        """Compute `next_token` [1, L], `logits` [L, vocab], `last_layer_kv` [1, S, kv_dim] and caches.
+
+        L: the call's last `MOST_ROWS` positions, or all of a shorter one.
+        """
         x, present, last_layer_kv = self.hidden_states(input_ids, visual_tokens, past, image_offset)
-        logits = self.lm_head(x[:, -1])
-        return logits.argmax(-1, keepdim=True), logits, last_layer_kv, *present
+        logits = self.lm_head(x[0, -MOST_ROWS:])
+        return logits.argmax(-1)[None], logits, last_layer_kv, *present

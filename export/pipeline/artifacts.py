@@ -25,11 +25,12 @@ from export.pipeline.report import report_html
 from export.pipeline.self_test import SELF_TEST_STAGE, known_answers, repeat_self_test
 from export.plan.plan import Plan, plan
 from export.targets.file import Target
+from firmware_bridge.system.input_file import read_json
 from reporting.progress import BuildProgress
 
 REPORT_JSON, REPORT_HTML, TOKENIZER_NAME = "report.json", "report.html", "tokenizer.json"
 NEW, OLD = "new", "old"
-RUNNER_KEYS = ("control_cores", "reasoning_cores", "control_priority", "decoding", "recovery")
+RUNNER_KEYS = ("control_cores", "reasoning_cores", "control_priority", "decoding", "recovery", "speculation")
 SHOWN_CHARACTERS = 60
 OLDER_SCHEMAS = (1, 2, 3)
 """Manifest schemas whose directories an export may replace."""
@@ -123,7 +124,7 @@ def _files_of(out: Path) -> dict[str, Any]:
         return dict(read_manifest(out)["files"])
     except ArtifactError:
         try:
-            older = json.loads((out / MANIFEST_NAME).read_bytes())
+            older = read_json(out / MANIFEST_NAME)
             files = dict(older["files"])
             ours = older["schema_version"] in OLDER_SCHEMAS and all(
                 file_sha256(out / name) == entry["sha256"] for name, entry in files.items()

@@ -47,6 +47,7 @@ from export.model.weights import weights_sha256
 from export.pipeline.job import Job
 from export.quantize.precision import PRECISIONS, Precision
 from export.quantize.rounding import activation_ranges
+from firmware_bridge.system.input_file import read_json
 from reporting.progress import BuildProgress, Stage
 
 WEIGHTS_FILE = "weights.json"
@@ -164,7 +165,7 @@ class Pipeline:
         def build(directory: Path) -> None:
             (directory / RESULT_NAME).write_text(json.dumps(compute(), allow_nan=False), encoding="utf-8")
 
-        content: dict[str, Any] = json.loads((self._stage(title, key, build) / RESULT_NAME).read_text(encoding="utf-8"))
+        content: dict[str, Any] = read_json(self._stage(title, key, build) / RESULT_NAME)
         return content
 
     def _key(
@@ -180,7 +181,7 @@ class Pipeline:
 
     def weights(self) -> WeightsRecord:
         """Hash and origin of the weights; raises CheckpointError."""
-        return WeightsRecord(**json.loads((self._weights_entry / WEIGHTS_FILE).read_text(encoding="utf-8")))
+        return WeightsRecord(**read_json(self._weights_entry / WEIGHTS_FILE))
 
     def tokenizer(self) -> bytes:
         """Return tokenizer.json for the weights."""

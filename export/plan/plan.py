@@ -20,7 +20,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from edge.state.switches import Speculation
 from export.model.config import TicVlaConfig
+from export.plan.guessing import GuessingTime, guessing_time
 from export.plan.timing import (
     GENERATION_STAGES,
     GIB,
@@ -65,6 +67,8 @@ class Plan:
     generation_alone: Estimate
     generation: Estimate | None
     """Generation while control runs; None if control leaves no time."""
+    guessing: GuessingTime | None
+    """Decoding with guesses; None: switched off, or no new tokens. The other times do not count on it."""
     work: Work
     duty: float
     """Largest share of reasoning in the time that control leaves."""
@@ -115,6 +119,7 @@ class Plan:
             "generation_ms": _rounded(self.generation.ms if self.generation else None),
             "generation_error": _rounded(self.generation.error if self.generation else None),
             "generation_alone_ms": _rounded(self.generation_alone.ms),
+            "speculation": self.guessing.to_dict() if self.guessing else None,
             "prompt_tokens": self.work.prompt_tokens,
             "tokens": self.tokens,
             "duty": _rounded(self.duty),
@@ -291,6 +296,11 @@ def _sized(
         generation = slowed if share.left == 1.0 else dataclasses.replace(slowed.times(1 / share.left), tag=MODELLED)
         delay_s = (generation.ms + slowed.ms / share.reasoning) / 1e3
         duty = share.reasoning / share.left
+    guessing = None
+    if tokens > 0 and target.runtime.speculation == Speculation.ON.value:
+        precision = chosen[stage_graph(target, "decode")]
+        others = [by_name[name].whole for name in GENERATION_STAGES if name != "decode"]
+        guessing = guessing_time(target, config, precision, work, by_name["decode"], others)
     weights = {name: graph_weights(target, config, name, chosen[name], work) for name in target.graph_names}
     made = Plan(
         target=target.name,
@@ -303,6 +313,7 @@ def _sized(
         tick=tick,
         generation_alone=generation_alone,
         generation=generation,
+        guessing=guessing,
         work=work,
         duty=duty,
         delay_s=delay_s,

@@ -7,6 +7,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from export.plan.guessing import ACCEPTANCE
 from export.plan.plan import Plan
 from export.plan.timing import GIB, Estimate
 from export.quantize.precision import Precision
@@ -42,6 +43,11 @@ def plan_lines(plan: Plan) -> list[str]:
             f"Δt          at most {plan.delay_s:.1f} s of {plan.max_delay_s:g} s, reasoning may run "
             f"{100 * plan.duty:.0f} % of the time that control leaves",
         ]
+    if (guessing := plan.guessing) is not None:
+        lines.append(
+            f"guessing    {_time(guessing.generation)} without control where it is exact: {guessing.rows} rows "
+            f"a call, {guessing.tokens_per_call:g} tokens, acceptance {ACCEPTANCE} (recorded texts)"
+        )
     if plan.average_w is not None:
         error = f" ± {plan.average_w * plan.average_w_error:.1f}" if plan.average_w_error else ""
         budget = f" of {plan.budget_w:g} W" if plan.budget_w is not None else ""

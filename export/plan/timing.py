@@ -127,7 +127,7 @@ def stage_calls(config: TicVlaConfig, graph: str, stage: str, work: Work) -> lis
 def stage_time(target: Target, config: TicVlaConfig, stage: str, precision: Precision, work: Work) -> StageTime:
     """Estimate the time of a stage's calls while nothing else runs."""
     graph = stage_graph(target, stage)
-    modelled = _modelled(target, config, stage, precision, work)
+    modelled = modelled_stage(target, config, stage, precision, work)
     point = _point(target, config.name, graph, stage, precision)
     if point is None:
         return modelled
@@ -145,7 +145,7 @@ def stage_time(target: Target, config: TicVlaConfig, stage: str, precision: Prec
         share = modelled.each.ms / modelled.whole.ms if modelled.whole.ms else 1.0
         energy_j = None if point.energy_j is None else point.energy_j * per
         return replace(modelled, whole=whole, each=whole.times(share), bound=MEASURED, energy_j=energy_j)
-    reference = _modelled(target, timed, stage, precision, _at(stage, work, point))
+    reference = modelled_stage(target, timed, stage, precision, _at(stage, work, point))
     reference_ms = reference.whole.ms / (reference.calls if stage == "decode" else 1)
     factor = measured_ms / reference_ms
     at = "" if taken is None else f" at {taken} tokens"
@@ -193,9 +193,20 @@ def _point(target: Target, model: str, graph: str, stage: str, precision: Precis
     return max(reversed(found), key=lambda point: point.date, default=None)
 
 
-def _modelled(target: Target, config: TicVlaConfig, stage: str, precision: Precision, work: Work) -> StageTime:
+def modelled_stage(
+    target: Target,
+    config: TicVlaConfig,
+    stage: str,
+    precision: Precision,
+    work: Work,
+    decode_calls: tuple[int, int] | None = None,
+) -> StageTime:
+    """Model a stage; `decode_calls`: rows and number of its calls, for decoding with guesses."""
     graph = stage_graph(target, stage)
     calls = stage_calls(config, graph, stage, work)
+    if decode_calls is not None:
+        rows, count = decode_calls
+        calls = [(language_call(config, graph, tokens=rows, past=work.prompt_tokens + work.new_tokens // 2), count)]
     timed = [(*_call_ms(target, graph, stage, call, precision), call, count) for call, count in calls]
     ms = sum(call_ms * count for call_ms, _, _, _, count in timed)
     error = sum(call_ms * count * (e or 0.0) for call_ms, e, _, _, count in timed) / ms if ms else None

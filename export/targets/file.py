@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from edge.artifacts.manifest import LANGUAGE_PAIR, LANGUAGE_WHOLE
-from export.core.typed import FieldError, SettingText, build, near, plain, tomllib
+from export.core.typed import FieldError, SettingText, build, near, plain
 from export.model.config import MODEL_PREFIX
 from export.quantize.precision import Precision, block_size
 from export.targets.sections import (
@@ -24,6 +24,7 @@ from export.targets.sections import (
     TargetError,
     TaskGate,
 )
+from firmware_bridge.system.input_file import read_toml
 
 SCHEMA = 2
 TARGETS_DIR = Path(__file__).parent
@@ -174,10 +175,10 @@ def load_target(name: str, model: str | None = None) -> Target:
         raise TargetError(f"target {name!r} is not known; expected one of: {names}, or the path of a .toml file")
     path = Path(name) if own else TARGETS_DIR / f"{name}.toml"
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = read_toml(path)
     except OSError as error:
         raise TargetError(f"{path}: cannot be read ({error.strerror})") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise TargetError(f"{path.name}: not TOML ({error})") from error
     target = parse_target(content, path.name)
     return target if model is None else for_model(target, model)

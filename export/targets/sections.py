@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from edge.artifacts.runtime import MAX_CORES, MAX_FRAMES, OLDEST_FRAME_S, RANGES
-from edge.state.switches import Decoding, RecoverySwitch
+from edge.state.switches import Decoding, RecoverySwitch, Speculation
 from export.core.typed import from_text, near
 from export.quantize.precision import PRECISIONS, Precision, block_size
 from firmware_bridge.core.config import BRIDGE_PRIORITY
@@ -318,6 +318,7 @@ class RuntimePolicy:
     """Real-time priority of the control thread, 1 to 59, below the bridge's; 0: none."""
     decoding: str = Decoding.CONSTRAINED.value
     recovery: str = RecoverySwitch.ON.value
+    speculation: str = Speculation.ON.value
     """Defaults of the runner's switches (`edge/state/switches.py`)."""
 
     def __post_init__(self) -> None:
@@ -338,6 +339,7 @@ class RuntimePolicy:
         _known(self.kv_dtype, KV_DTYPES, "kv_dtype")
         _known(self.decoding, tuple(each.value for each in Decoding), "decoding")
         _known(self.recovery, tuple(each.value for each in RecoverySwitch), "recovery")
+        _known(self.speculation, tuple(each.value for each in Speculation), "speculation")
         for name in ("control_cores", "reasoning_cores"):
             cores = getattr(self, name)
             _require(all(0 <= core < MAX_CORES for core in cores), f"{name} {list(cores)} must be 0 to {MAX_CORES - 1}")

@@ -7,7 +7,6 @@ only the `[dds]` addresses differ. The tables are declared in `sections.py` and 
 from __future__ import annotations
 
 import math
-import sys
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Final, get_args, get_type_hints
@@ -30,11 +29,7 @@ from firmware_bridge.core.sections import (
     runtime_dir,
     speed_hint,
 )
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from firmware_bridge.system.input_file import read_toml
 
 __all__ = [
     "BRIDGE_PRIORITY",
@@ -149,9 +144,10 @@ class RobotConfig:
 def load_robot_config(path: Path | str, *, socket: Path | None = None, domain: int | None = None) -> RobotConfig:
     """Read a robot file; `socket` and `domain` replace its own. Raises ConfigError with one clear line."""
     try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, RecursionError, tomllib.TOMLDecodeError) as error:
-        raise ConfigError(f"robot file {path}: cannot be read: {error}") from error
+        table = read_toml(Path(path))
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ConfigError(f"robot file {path}: cannot be read: {reason}") from error
     try:
         safety = table.get("safety")
         if table.get("protocol") in LINKS and table["protocol"] != "unitree" and isinstance(safety, dict):

@@ -7,6 +7,8 @@ import queue
 import threading
 from typing import TextIO
 
+from firmware_bridge.system.terminal import one_line
+
 
 class LineLog:
     """Bounded queue in front of a text stream. `write` never waits; a line that does not fit is dropped and counted."""
@@ -35,5 +37,5 @@ class LineLog:
     def _drain(self) -> None:
         for line in iter(self._lines.get, None):
             with contextlib.suppress(OSError, ValueError):  # closed or full: no reader is left
-                self._stream.write(f"{self._prefix}: {line}\n")
+                self._stream.write(f"{self._prefix}: {one_line(line)}\n")
                 self._stream.flush()

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE
+from firmware_bridge.system.terminal import CommandParser
 from sim_hil.benchmark.policies.external_protocol import (
     PROTOCOL,
     VERSION,
@@ -110,7 +111,7 @@ def server(address: Address) -> socketserver.BaseServer:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command and return its exit code."""
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="python -m sim_hil.benchmark.external_example",
         description=__doc__,
         epilog=EXAMPLES,

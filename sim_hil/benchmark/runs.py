@@ -9,13 +9,13 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from fnmatch import fnmatchcase
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from edge.core.cli import write_whole
 from edge.core.stats import percentiles
+from firmware_bridge.system.input_file import read_json
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.conditions.rewording import reworded
 from sim_hil.benchmark.policies.select import check_artifacts, open_policy
@@ -63,7 +63,7 @@ class BenchRun:
             )
         artifacts = check_artifacts(conditions)
         if artifacts is not None:
-            conditions = conditions.with_defaults_of(artifacts.runtime.decoding, artifacts.runtime.recovery)
+            conditions = conditions.with_defaults_of(artifacts.runtime.switches)
         sha256, trained = ("", True) if artifacts is None else (artifacts.manifest_sha256, artifacts.trained)
         run = BenchRun(suite, tuple(episodes), conditions, sha256, trained)
         run.tasks(Path())
@@ -94,18 +94,6 @@ class BenchRun:
         ]
         # Simulation time grows with the time limit and the crowd.
         return sorted(tasks, key=lambda task: -task.episode.timeout_s * (20 + task.episode.people))
-
-
-def choose(episodes: Sequence[Episode], patterns: Sequence[str]) -> list[Episode]:
-    """Return the episodes whose id matches a pattern, all without patterns. Raises ConditionsError if none matches."""
-    for pattern in patterns:
-        if not any(fnmatchcase(episode.id, pattern) for episode in episodes):
-            some = ", ".join(episode.id for episode in episodes[:3])
-            raise ConditionsError(
-                f"--episodes {pattern!r}: expected a pattern of ids such as {some}, ...; none matches"
-            )
-    wanted = patterns or ("*",)
-    return [episode for episode in episodes if any(fnmatchcase(episode.id, pattern) for pattern in wanted)]
 
 
 def versions() -> dict[str, str]:
@@ -244,5 +232,5 @@ def run_episodes(
 
 def read_result(out: Path) -> dict[str, Any]:
     """Return the content of `result.json` of a finished run."""
-    content: dict[str, Any] = json.loads((out / RESULT).read_text(encoding="utf-8"))
+    content: dict[str, Any] = read_json(out / RESULT)
     return content

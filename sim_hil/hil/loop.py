@@ -10,14 +10,13 @@ import time
 from collections.abc import Sequence
 from typing import Final
 
-from sim_hil.hil.trace import TraceWriter
+from sim_hil.hil.trace import POSE_HZ, TraceWriter
 from sim_hil.protocols.front_end import FrontEnd, FrontEndOptions
 from sim_hil.simulation.physics import Simulation
 
 BATCH_NS: Final = 4_000_000
 MAX_LAG_NS: Final = 200_000_000  # largest lag that is caught up; beyond it, the simulated world falls behind
 MAX_STEPS: Final = 4  # physics steps between two services of the front end, also while catching up
-POSE_HZ: Final = 10
 PEOPLE_HZ: Final = 5
 STEPS_PER_S: Final = round(1 / Simulation.DT_S)
 _STEP_NS: Final = 1_000_000_000 // STEPS_PER_S

@@ -14,6 +14,9 @@ from edge.core.cli import open_stream
 _CAPACITY: Final = 4096
 _CLOSE_S: Final = 10.0  # longest wait at the end, s: a hanging reader of a FIFO must not block it
 
+POSE_HZ: Final = 10
+"""Default rate of poses in a trace, Hz."""
+
 
 class TraceWriter:
     """Writer of a trace whose `put` never blocks; lines that do not fit the queue are counted in `dropped`.

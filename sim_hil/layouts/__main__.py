@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 from edge.core.cli import check_result_target, command_line, write_named, write_result
+from firmware_bridge.system.terminal import CommandParser
 from sim_hil.layouts import BENCHMARK_SEEDS, KINDS, RESERVED_BELOW, LayoutError, generate
 from sim_hil.scene.map import draw_map
 from sim_hil.scene.scene import Scene, scene_to_toml
@@ -20,7 +21,7 @@ exit codes: 0 done, 1 no sound layout for this seed, 2 bad arguments"""
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="python -m sim_hil.layouts", description="Generate a layout of one of DynaNav's environments.",
         epilog=_EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip

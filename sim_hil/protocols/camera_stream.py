@@ -9,7 +9,6 @@ Every image has the header "X-Capture-Ns": time.monotonic_ns of the rendered pos
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import signal
 import socket
@@ -20,6 +19,7 @@ from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final, TextIO
 
+from firmware_bridge.system.terminal import CommandParser
 from sim_hil.processes.child_process import Message, input_is_open, take_standard_output, write_message
 from sim_hil.protocols.front_end import FrontEndOptions
 from sim_hil.protocols.render_process import RenderProcess, encode_jpeg
@@ -200,7 +200,7 @@ def _render_while_parent_lives(
 
 def main(argv: list[str] | None = None) -> int:
     """Run the camera process until stdin closes."""
-    parser = argparse.ArgumentParser(prog="edge-hil camera", description="started by edge-hil")
+    parser = CommandParser(prog="edge-hil camera", description="started by edge-hil")
     parser.add_argument("--scene", required=True)
     parser.add_argument("--robot", required=True)
     for name in ("people", "seed", "width", "height", "listen-fd", "pose-fd"):

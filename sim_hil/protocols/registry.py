@@ -10,13 +10,15 @@ import importlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from sim_hil.protocols.front_end import FrontEnd, FrontEndError, FrontEndOptions
-from sim_hil.simulation.physics import Simulation
+
+if TYPE_CHECKING:
+    from sim_hil.simulation.physics import Simulation  # loads physics: a command line is checked without it
 
 _FOLDER: Final = Path(__file__).parent
-Opener = Callable[[Simulation, FrontEndOptions], FrontEnd]
+Opener = Callable[["Simulation", FrontEndOptions], FrontEnd]
 
 _SPOKEN_BY: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {"unitree": ("go2",), "mavlink": ("carter",), "can": ("carter",), "ros2": ("carter",)}

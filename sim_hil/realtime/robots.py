@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import socket
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,13 +13,11 @@ from typing import Any, Final
 import tomli_w
 
 import firmware_bridge
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from firmware_bridge.system.input_file import read_toml
 
 ROBOT_FILES: Final = Path(firmware_bridge.__file__).parent / "robots"
+MAX_DOMAIN: Final = 232
+"""Largest DDS domain whose ports exist."""
 BRIDGE_SOCKET: Final = "bridge"
 """Name of the bridge's socket in the folder of a run's sockets."""
 
@@ -41,7 +38,7 @@ class RunAddress:
     """TCP port of the HTTP camera."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.domain <= 232:
+        if not 0 <= self.domain <= MAX_DOMAIN:
             raise ValueError(f"--domain: expected 0 to 232 (DDS), found {self.domain}")
 
     @staticmethod
@@ -90,8 +87,8 @@ class StackRobot:
         Raises StackRobotError if the shipped file cannot be used, OSError if `path` cannot be written.
         """
         try:
-            content = tomllib.loads(self.file.read_text(encoding="utf-8"))
-        except (OSError, tomllib.TOMLDecodeError) as error:
+            content = read_toml(self.file)
+        except (OSError, ValueError) as error:
             raise StackRobotError(f"--robot {self.name}: {self.file}: cannot be read: {error}") from error
         for key, template in (("bridge.socket", f"{{folder}}/{BRIDGE_SOCKET}"), *self.values):
             _put(content, key, address.filled(template))

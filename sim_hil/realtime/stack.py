@@ -176,6 +176,7 @@ class Stack:
         asked = options.switches
         command += ["--decoding", asked.decoding.value] if asked.decoding else []
         command += ["--recovery", asked.recovery.value] if asked.recovery else []
+        command += ["--speculation", asked.speculation.value] if asked.speculation else []
         if asked.stand_at_goal is not None:
             command += ["--stay" if asked.stand_at_goal else "--no-stay"]
         self.runner = self._children.start(name, command)

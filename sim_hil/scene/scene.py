@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, asdict, dataclass, fields
 from math import degrees, radians
@@ -11,6 +10,7 @@ from typing import Any
 
 import tomli_w
 
+from firmware_bridge.system.input_file import parse_toml, read_text
 from sim_hil.scene.kinds import KINDS
 from sim_hil.scene.parts import (
     CEILING_TEXTURES,
@@ -30,11 +30,6 @@ from sim_hil.scene.parts import (
     check_choice,
 )
 from sim_hil.scene.table import SceneError, Table
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 __all__ = [
     "CEILING_TEXTURES", "FLOOR_TEXTURES", "KINDS", "SCENES", "SKY", "TEXTURES",
@@ -124,8 +119,8 @@ class Scene:
 def parse_scene(text: str, source: str) -> Scene:
     """Build a scene from TOML text; `source` names it in errors. Raises SceneError."""
     try:
-        raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        raw = parse_toml(text)
+    except ValueError as error:
         raise SceneError(f"{source}: not valid TOML: {error}") from error
     try:
         table = Table("scene", raw)
@@ -165,7 +160,7 @@ def load_scene(name_or_path: str | Path) -> Scene:
                 " or the path of a scene file that ends in .toml"
             )
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
     except (OSError, UnicodeDecodeError) as error:
         raise SceneError(f"{path}: cannot be read as a scene file: {error}") from error
     return parse_scene(text, path.name)

@@ -21,6 +21,7 @@ from PIL import Image, ImageDraw, UnidentifiedImageError
 from edge.core.cli import write_whole
 from edge.core.geometry import SE2
 from edge.flightlog.reader import RecordingError, jpeg_bytes, read_messages
+from firmware_bridge.system.input_file import read_json
 from sim_hil.realtime.truth import read_lines
 from sim_hil.soak.leg import EVENTS, LEG, SAMPLES
 
@@ -94,7 +95,7 @@ def read_life(path: Path, result: Path, run: int) -> LifeData | None:
     except (OSError, RecordingError):
         return None
     try:
-        content = json.loads(result.read_text(encoding="utf-8"))
+        content = read_json(result)
         life.delay_error_ms_max = content["delay_error_ms"]["max"]
         life.dropped = sum(content.get("recorder", {}).get("dropped", {}).values())
     except (OSError, ValueError, KeyError, AttributeError):
@@ -235,7 +236,7 @@ def _path_m(trace: TraceData, begin_ns: int, end_ns: int) -> float:
 
 def analyse(folder: Path) -> dict[str, Any]:
     """Analyse a leg's folder for the report, write the analysis as JSON and return it. Raises OSError."""
-    about = json.loads((folder / LEG).read_text(encoding="utf-8"))
+    about = read_json(folder / LEG)
     events = list(read_lines(folder / EVENTS))
     samples = list(read_lines(folder / SAMPLES))
     trace = read_trace(folder / TRACE)
@@ -338,7 +339,7 @@ def keep_moments(folder: Path, analysis: Mapping[str, object]) -> None:
 def read_moments(folder: Path) -> list[Moment]:
     """Read the moments written by `keep_moments`; empty if the leg was killed before."""
     try:
-        return [Moment(**row) for row in json.loads((folder / MOMENTS).read_text(encoding="utf-8"))]
+        return [Moment(**row) for row in read_json(folder / MOMENTS)]
     except (OSError, ValueError, TypeError):
         return []
 

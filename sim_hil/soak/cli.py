@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,102 +16,23 @@ from edge.core.cli import (
     EXIT_DONE,
     EXIT_INTERRUPTED,
     EXIT_REFUSED,
-    check_result_target,
     command_line,
     stop_signals,
     write_result,
 )
 from firmware_bridge.core.config import load_robot_config
+from firmware_bridge.system.terminal import one_line
 from reporting.progress import Progress
 from sim_hil.realtime.children import StepError
-from sim_hil.realtime.robots import GO2, ROBOTS, free_domain
-from sim_hil.robots.odometry_noise import LEVELS
-from sim_hil.scene.scene import SceneError, load_scene
+from sim_hil.realtime.robots import ROBOTS, free_domain
+from sim_hil.scene.scene import SceneError
+from sim_hil.soak.arguments import UNTRAINED_MPS, check, parser
 from sim_hil.soak.faults import DEFAULT_MENU, SoakInputError, load_menu
 from sim_hil.soak.report import write_report
 from sim_hil.soak.run import SoakFolder, SoakOptions, lost_budget, run_legs, soak_result
 from sim_hil.soak.verdict import DEFAULT_BUDGET, PASS, UNDECIDED, applicable, load_budget
 
-MODES: Final = ("async", "sync", "no-reasoning")
 STATUS_PERIOD_S: Final = 30.0
-UNTRAINED_MPS: Final = 0.14
-"""Default speed limit for untrained weights, m/s: they drive into walls, which below 0.2 m/s (edge.odometry.gate) does
-not end the run, so that the growth of the runner can be measured."""
-_UNITS_S: Final = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0}
-
-EXAMPLES = """examples:
-  edge-soak --artifacts out/nano --duration 1h --out out/soak
-  edge-soak --artifacts out/nano --duration 8h --leg 30m --people 12 --scene hospital --scene office --out out/night
-  edge-soak --artifacts out/nano --duration 8h --out out/night --resume      # with the same options, after a kill
-  edge-soak --artifacts out/nano --duration 5m --faults none --json - --out out/quick
-  edge-soak --artifacts out/nano --duration 1h --robot carter-can --out out/carter
-
-A leg is one run of the stack (edge-hil, edge-bridge, edge-run) in one scene, with one task after another.
-Default budget and faults: sim_hil/soak/budget.toml and sim_hil/soak/faults.toml; copy and change them. Only the go2
-has the faults of the robot's side: other robots get those that end a process.
-A soak ends after the leg in which a budget line failed that no later leg can mend.
-exit codes: 0 budget met, 1 budget exceeded, undecided, or no leg could run, 2 bad arguments or input,
-            3 refused (artifacts), 130 interrupted (a report of the finished part is written)
-"""
-
-
-def parser() -> argparse.ArgumentParser:
-    """Return the argument parser."""
-    p = argparse.ArgumentParser(
-        "edge-soak", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    p.add_argument("--artifacts", type=Path, required=True, metavar="DIR", help="directory made by edge-export")
-    p.add_argument(
-        "--duration", type=parse_seconds, required=True, metavar="T", help="total time, such as 90s, 10m, 1h or 1d"
-    )
-    p.add_argument(
-        "--out",
-        type=Path,
-        required=True,
-        metavar="DIR",
-        help="directory for samples, legs, result.json and report.html",
-    )
-    p.add_argument("--faults", default="default", metavar="FILE|none", help="fault menu (default: the package's)")
-    p.add_argument("--budget", type=Path, metavar="FILE", help="budget file (default: the package's)")
-    p.add_argument(
-        "--scene",
-        action="append",
-        metavar="NAME|FILE",
-        help="scene (default hospital); if repeated, one per leg in turn",
-    )
-    p.add_argument("--people", type=int, default=6, metavar="N", help="walking people (default 6)")
-    p.add_argument(
-        "--seed", type=int, default=0, metavar="N", help="random seed of tasks, people and faults (default 0)"
-    )
-    p.add_argument("--leg", type=parse_seconds, default=1200.0, metavar="T", help="length of a leg (default 20m)")
-    p.add_argument("--mode", choices=MODES, default="async", help="reasoning mode of edge-run (default async)")
-    p.add_argument("--release-delay", default="0", metavar="S|PROFILE", help="release delay of edge-run (default 0)")
-    p.add_argument(
-        "--odometry-noise", choices=tuple(LEVELS), default="none", help="odometry drift in edge-hil (default none)"
-    )
-    p.add_argument(
-        "--speed-limit",
-        type=float,
-        metavar="MPS",
-        help=f"forward speed limit (default: the robot file's; untrained weights: {UNTRAINED_MPS})",
-    )
-    p.add_argument("--robot", choices=tuple(ROBOTS), default=GO2.name, help=f"robot to drive (default {GO2.name})")
-    p.add_argument("--domain", type=int, metavar="N", help="DDS domain of a robot with DDS (default: a free one)")
-    p.add_argument("--keep-logs", action="store_true", help="keep the flight logs (about 0.5 GiB an hour)")
-    p.add_argument(
-        "--to-the-end", action="store_true", help="drive on although a budget line failed that no later leg can mend"
-    )
-    p.add_argument("--resume", action="store_true", help="continue the soak in --out for the remaining time")
-    p.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
-    return p
-
-
-def parse_seconds(text: str) -> float:
-    """Parse a time such as 90s, 10m, 1.5h, 1d or 90 to seconds. Raises argparse.ArgumentTypeError."""
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd]?)", text, re.ASCII)
-    if match is None:
-        raise argparse.ArgumentTypeError(f"expected a time such as 90s, 10m or 1h, found {text!r}")
-    return float(match[1]) * _UNITS_S[match[2] or "s"]
 
 
 @command_line("edge-soak")
@@ -120,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command and return its exit code (see EXAMPLES)."""
     args = parser().parse_args(argv)
     try:
-        check_result_target(args.json)
+        check(args)
         options = options_of(args)
         menus = {"none": None, "default": DEFAULT_MENU}
         menu_file = menus.get(args.faults, Path(args.faults))
@@ -179,13 +99,9 @@ def options_of(args: argparse.Namespace) -> SoakOptions:
     """Build the options from the arguments. Raises ArtifactError, SoakInputError, SceneError or ValueError."""
     artifacts = load_artifacts(args.artifacts.absolute())
     scenes = tuple(args.scene or ("hospital",))
-    for scene in scenes:
-        load_scene(scene)
     limit_mps = args.speed_limit
     if limit_mps is None and not artifacts.trained:
         limit_mps = UNTRAINED_MPS
-    if limit_mps is not None and not 0.02 <= limit_mps <= 1.5:
-        raise SoakInputError(f"--speed-limit: expected 0.02 to 1.5 m/s, found {limit_mps}")
     return SoakOptions(
         artifacts=args.artifacts.absolute(),
         manifest_sha256=artifacts.manifest_sha256,
@@ -225,7 +141,7 @@ def summary_lines(result: Mapping[str, Any]) -> str:
 
 
 def _print(line: str) -> None:
-    sys.stderr.write(f"edge-soak: {line}\n")
+    sys.stderr.write(f"edge-soak: {one_line(line)}\n")
     sys.stderr.flush()
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-import sys
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -15,16 +14,12 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from edge.safety.faults.table import FAULTS
+from firmware_bridge.system.input_file import read_toml
 from sim_hil.protocols.fault_socket import FaultError
 from sim_hil.protocols.unitree.fault_commands import KINDS, FaultCommandError, Value, parse
 from sim_hil.realtime.robots import StackRobot
 from sim_hil.realtime.stack import Stack
 from sim_hil.scene.table import Table
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 T = TypeVar("T")
 
@@ -156,7 +151,7 @@ def _fault(table: Table) -> SoakFault:
 def read_file(path: Path, read: Callable[[Table], T]) -> T:
     """Read a TOML file of FORMAT and return `read(table)`. Raises SoakInputError."""
     try:
-        table = Table("the file", tomllib.loads(path.read_text(encoding="utf-8")), SoakInputError)
+        table = Table("the file", read_toml(path), SoakInputError)
         if table.whole("format") != FORMAT:
             raise SoakInputError(f"expected format {FORMAT}")
         content = read(table)

@@ -20,6 +20,7 @@ import psutil
 
 from edge.core.device import read_device
 from edge.run.say import SayError, say
+from firmware_bridge.system.input_file import read_json
 from sim_hil.realtime.children import StepError
 from sim_hil.realtime.stack import Stack, StackOptions
 from sim_hil.realtime.truth import TruthTail
@@ -305,7 +306,7 @@ class Leg:
 def _end_of_run(result: Path) -> tuple[str, set[str]]:
     """Return the runner's own reason for its end and all faults that it raised; empty if it was killed."""
     try:
-        content = json.loads(result.read_text(encoding="utf-8"))
+        content = read_json(result)
         faults, raised = content["faults"], set(content["control"]["faults"])
     except (OSError, ValueError, KeyError):
         return "", set()

@@ -15,6 +15,7 @@ import numpy as np
 from edge.core.cli import write_whole
 from edge.core.stats import percentiles
 from edge.flightlog.recorder import space_refusal
+from firmware_bridge.system.input_file import read_json
 from sim_hil.protocols.fault_socket import FaultError
 from sim_hil.realtime.children import StepError
 from sim_hil.realtime.robots import ROBOTS
@@ -108,7 +109,7 @@ class SoakFolder:
     def resume(path: Path, options: SoakOptions) -> SoakFolder:
         """Open the folder of a soak with the same options; analyse unfinished legs. Raises SoakInputError."""
         try:
-            before = json.loads((path / CONFIG).read_text(encoding="utf-8"))
+            before = read_json(path / CONFIG)
         except (OSError, ValueError) as error:
             raise SoakInputError(f"--resume: {path} contains no soak to continue ({error})") from error
         now = options.config()
@@ -127,7 +128,7 @@ class SoakFolder:
         found = SoakFolder(path)
         for folder in sorted((path / LEGS).iterdir()):
             if (folder / ANALYSIS).exists():
-                found.legs.append(json.loads((folder / ANALYSIS).read_text(encoding="utf-8")))
+                found.legs.append(read_json(folder / ANALYSIS))
             elif (folder / LEG).exists() and (folder / SAMPLES).exists():
                 found.legs.append(analyse(folder))  # the soak was killed during this leg
             else:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from edge.commands import COMMANDS
+from edge.commands import ARGUMENTS, COMMANDS
 from edge.core.cli import EXIT_BAD_INPUT, check_result_target, run_with_extra, write_result
 
 MODULES = [*sorted(module for module, _ in COMMANDS.values()), "firmware_bridge.bridge"]
@@ -66,17 +66,19 @@ def test_version_needs_none_of_the_extras(command: str) -> None:
 @pytest.mark.parametrize(
     ("command", "extra"),
     [
-        ("edge-run", "cpu"), ("edge-calib", "cpu"), ("edge-export", "export"),
-        ("edge-hil", "sim"), ("edge-bench", "sim"), ("edge-soak", "sim"), ("edge-train", "train"),
+        ("edge-run --help", "cpu"), ("edge-calib --help", "cpu"), ("edge-export --dry-run", "export"),
+        ("edge-hil --robot go2 --scene corridor --protocol unitree", "sim"),
+        ("edge-bench --suite dynanav --policy expert", "sim"),
+        ("edge-soak --artifacts none --duration 1m --out none", "sim"), ("edge-train sft --out none", "train"),
     ],
 )  # fmt: skip
 def test_a_missing_extra_is_one_line_that_names_it(command: str, extra: str) -> None:
-    done = base_only(command, "--help")
+    done = base_only(*command.split())
     assert done.returncode == EXIT_BAD_INPUT
     assert done.stderr.count("\n") == 1 and f"pip install 'tic-vla-edge[{extra}]'" in done.stderr
 
 
-@pytest.mark.parametrize("command", ["edge-say", "edge-bridge", "edge-install", "edge-doctor"])
+@pytest.mark.parametrize("command", ["edge-say", "edge-bridge", "edge-install", "edge-doctor", *ARGUMENTS])
 def test_help_works_in_the_base_install(command: str) -> None:
     done = base_only(command, "--help")
     assert done.returncode == 0 and "usage:" in done.stdout, done.stderr

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +22,18 @@ from export.targets.file import graph_names
 Floats = npt.NDArray[np.float32]
 
 
-def write_artifacts(model: TicVla, directory: Path, *, pair: bool = False, precision: Precision | None = None) -> Path:
-    """The graphs of a model with nano's tokenizer, in one precision, and a manifest that lists them."""
-    config, graphs = model.config, {}
+def write_artifacts(
+    model: TicVla,
+    directory: Path,
+    *,
+    pair: bool = False,
+    precision: Precision | None = None,
+    precisions: Mapping[str, Precision] | None = None,
+) -> Path:
+    """The graphs of a model with nano's tokenizer, in one precision but for `precisions`, and their manifest."""
+    config, graphs, chosen = model.config, {}, precisions or {}
     for name in graph_names(pair=pair):
-        files = write_graph(model, name, precision or Precision("fp32"), "fused", directory)
+        files = write_graph(model, name, chosen.get(name, precision or Precision("fp32")), "fused", directory)
         session = {"provider": "CPUExecutionProvider", "options": {}, "threads": None, "engine": False}
         graphs[name] = {
             "file": files[0],

@@ -14,8 +14,10 @@ import itertools
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -27,9 +29,11 @@ from edge.core.cli import EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, com
 from edge.core.geometry import SE2
 from edge.flightlog.reader import RecordingError, read_messages
 from edge.inference.policy import Policy
+from edge.inference.warm_up import Opened, open_proven
 from edge.power.monitor import PowerMonitor
 from edge.reasoning.generation_cycle import UNLIMITED, ReasoningBudget
 from edge.run import command as runner
+from edge.run import session
 from edge.state.semantic import SemanticState
 from sim_hil.realtime.children import Children, StepError
 from sim_hil.realtime.robots import GO2
@@ -83,7 +87,14 @@ def drive(arguments: Sequence[str]) -> int:
         pose = semantic.T_odom_anchor @ offset
         return circle.plan(pose, len(planned), STEP_S, RIPPLE_RAD * next(calls))
 
-    with mock.patch.object(PowerMonitor, "budget", budget), mock.patch.object(Policy, "act", circling):
+    def open_circling(*args: Any, **kwargs: Any) -> Opened:
+        opened = open_proven(*args, **kwargs)  # the self-test judges the graphs' own plans
+        stack.enter_context(mock.patch.object(Policy, "act", circling))
+        return opened
+
+    with ExitStack() as stack:
+        stack.enter_context(mock.patch.object(PowerMonitor, "budget", budget))
+        stack.enter_context(mock.patch.object(session, "open_proven", open_circling))
         return runner.main(list(arguments))
 
 

@@ -185,7 +185,7 @@ def ours_in_torch(work: Work) -> Arrays:
 
 
 def ours_as_graphs(work: Work) -> Arrays:
-    """Compute the outputs with ONNX Runtime; a graph returns the logits of its last position only."""
+    """Compute the outputs with ONNX Runtime; a graph returns the logits of its last positions only."""
     import onnxruntime as ort
 
     options = ort.SessionOptions()
@@ -218,7 +218,7 @@ def ours_as_graphs(work: Work) -> Arrays:
         }
         next_token, logits, kv, *buffers = language.run(names, feeds)
         prompt = prompt or {"logits": logits, "last_layer_kv": kv}
-        feed = [int(next_token[0, 0])]
+        feed = [int(next_token[0, -1])]
         text += feed
     return {"visual_tokens": visual, **prompt, "text": np.array(text)}
 

@@ -32,6 +32,7 @@ from rich.table import Table
 from edge.artifacts.files import ArtifactError
 from edge.artifacts.manifest import load_artifacts
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, command_line, write_result, write_whole
+from firmware_bridge.system.terminal import CommandParser
 from tools.bench.peers.contenders import (
     EVERYTHING,
     OURS,
@@ -232,7 +233,7 @@ def show(verdicts: Sequence[Verdict]) -> None:
 
 def arguments(argv: list[str] | None) -> argparse.Namespace:
     """Parse the command line."""
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = CommandParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument(
         "--artifacts", type=Path, metavar="DIR", help="artifacts to compare; without it only the peers are measured"
     )

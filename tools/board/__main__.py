@@ -19,7 +19,19 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, command_line, messages, write_result
+from edge.artifacts.files import read_manifest
+from edge.core.cli import (
+    EXIT_BAD_INPUT,
+    EXIT_CHECK_FAILED,
+    EXIT_DONE,
+    check_result_directory,
+    command_line,
+    messages,
+    write_result,
+)
+from edge.flightlog.reader import read_messages
+from firmware_bridge.system.terminal import CommandParser
+from sim_hil.realtime.robots import MAX_DOMAIN
 from tools.board import drive as board_drive
 from tools.board import journey
 from tools.board.journey import HOME, INPUT, INSTALLER, ROBOT_FILE
@@ -34,11 +46,12 @@ LINES: Final = 40  # of a step's output in the result
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = _parser().parse_args(argv)
+    try:
+        _check(args)
+    except (ValueError, OSError) as error:
+        messages("board")(str(error))
+        return EXIT_BAD_INPUT
     args.out.mkdir(parents=True, exist_ok=True)
-    for path in (args.artifacts / "manifest.json", args.flight):
-        if not path.is_file():
-            messages("board")(f"{path}: no such file")
-            return EXIT_BAD_INPUT
     make_root(args.root)
     (args.out / "transcript.txt").unlink(missing_ok=True)
     wheels = _copy(args)
@@ -48,8 +61,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     return EXIT_DONE if all(step["passed"] for step in results) else EXIT_CHECK_FAILED
 
 
+def _check(args: argparse.Namespace) -> None:
+    """Check the arguments before a root is made, which takes half an hour. Raises ValueError or OSError."""
+    read_manifest(args.artifacts)
+    if not 0 < args.replay_to < 1e6:
+        raise ValueError(f"--replay-to {args.replay_to}: expected seconds above 0")
+    if not 0 <= args.domain <= MAX_DOMAIN:
+        raise ValueError(f"--domain {args.domain}: expected 0 to {MAX_DOMAIN}")
+    check_result_directory(args.out)
+    if next(read_messages(args.flight), None) is None:
+        raise ValueError(f"--flight {args.flight}: expected a flight log with messages")
+    check_result_directory(args.root, "--root")
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         "python -m tools.board", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(

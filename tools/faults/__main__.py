@@ -21,20 +21,23 @@ from pathlib import Path
 
 from rich.console import Console
 
+from edge.artifacts.files import read_manifest
 from edge.core.cli import (
     EXIT_BAD_INPUT,
     EXIT_CHECK_FAILED,
     EXIT_DONE,
     EXIT_INTERRUPTED,
+    check_result_directory,
     check_result_target,
     command_line,
     messages,
     write_result,
 )
 from edge.flightlog.recorder import space_refusal
+from firmware_bridge.system.terminal import CommandParser
 from sim_hil.protocols.fault_socket import FaultError
 from sim_hil.realtime.children import StepError, uninterrupted
-from sim_hil.realtime.robots import GO2, ROBOTS, StackRobot
+from sim_hil.realtime.robots import GO2, MAX_DOMAIN, ROBOTS, StackRobot
 from sim_hil.realtime.stack import socket_dir
 from tools.faults.host_stall import HostStall
 from tools.faults.measure import Sample, injection
@@ -56,7 +59,7 @@ exit codes: 0 every bound held, 1 a bound did not hold or an injection failed, 2
 
 def parser() -> argparse.ArgumentParser:
     """Return the argument parser."""
-    p = argparse.ArgumentParser(
+    p = CommandParser(
         "python -m tools.faults",
         description=__doc__,
         epilog=EXAMPLES,
@@ -207,6 +210,11 @@ def main(argv: list[str] | None = None) -> int:
             return EXIT_DONE
         if not args.list and (args.artifacts is None or not args.artifacts.is_dir()):
             raise ValueError(f"--artifacts {args.artifacts}: expected a directory made by edge-export")
+        if not args.list:
+            read_manifest(args.artifacts)
+        check_result_directory(args.out)
+        if args.domain is not None and not 0 <= args.domain <= MAX_DOMAIN:
+            raise ValueError(f"--domain: expected 0 to {MAX_DOMAIN}, found {args.domain}")
         args.out.mkdir(parents=True, exist_ok=True)
     except (ValueError, OSError) as error:
         _print(str(error))

@@ -24,13 +24,15 @@ from edge.core.cli import (
     stop_signals,
     write_result,
 )
+from firmware_bridge.system.terminal import CommandParser
 from reporting.progress import duration
+from sim_hil.benchmark.arguments import MAX_JOBS, choose
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.conditions.latency import LatencyError, LatencyProfile, parse_latency
 from sim_hil.benchmark.language.instructions import is_held_out
 from sim_hil.benchmark.results.record import EpisodeResult, ResultError
 from sim_hil.benchmark.results.store import StoreError, read_results
-from sim_hil.benchmark.runs import RESULT, RunsError, choose, read_result, run_episodes
+from sim_hil.benchmark.runs import RESULT, RunsError, read_result, run_episodes
 from sim_hil.benchmark.suite.episode import Episode, SuiteError, load_suite
 from sim_hil.benchmark.workers.jobs import RefusedRunError
 from sim_hil.benchmark.workers.progress import BenchProgress
@@ -72,7 +74,7 @@ class Plan:
 
 def parser() -> argparse.ArgumentParser:
     """Return the argument parser."""
-    p = argparse.ArgumentParser(
+    p = CommandParser(
         "python -m tools.findings", description=__doc__, epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
@@ -106,6 +108,8 @@ def _main(args: argparse.Namespace) -> int:
     check_result_target(args.json)
     if not args.artifacts.is_dir():
         raise ConditionsError(f"--artifacts {args.artifacts}: expected a folder of exported models")
+    if not 1 <= args.jobs <= MAX_JOBS:
+        raise ConditionsError(f"--jobs: expected 1 to {MAX_JOBS}, found {args.jobs}")
     base = parse_latency(args.latency)
     rows = rows_of(args.rows)
     episodes = choose(load_suite(args.suite), args.episodes)

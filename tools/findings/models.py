@@ -13,6 +13,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, command_line, messages
+from firmware_bridge.system.terminal import CommandParser
 from tools.findings.rows import AFTER, BEFORE
 from tools.train.config.recipe import Recipe, RecipeError, load_recipe
 from tools.train.run.network_file import COMMAND, ExportError, export_artifacts, stage_weights
@@ -82,7 +83,7 @@ def _recipe(run: Path) -> Recipe:
 
 def parser() -> argparse.ArgumentParser:
     """Return the argument parser."""
-    p = argparse.ArgumentParser(
+    p = CommandParser(
         "python -m tools.findings.models", description=__doc__, epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, command_line
 from firmware_bridge.core.config import ConfigError, load_robot_config
+from firmware_bridge.system.terminal import CommandParser
 from sim_hil.realtime.robots import ROBOT_FILES, free_domain
 from tools.fuzz.harness import FuzzError, Target, fuzz, to_stderr
 
@@ -52,7 +53,7 @@ def open_target(decoder: str, robot: Path) -> Target:
 @command_line("fuzz")
 def main(argv: list[str] | None = None) -> int:
     """Run the command and return its exit code."""
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="python -m tools.fuzz", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--decoder", choices=sorted(ROBOTS), required=True)

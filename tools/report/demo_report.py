@@ -8,7 +8,6 @@ of the artifacts that settings.json names, and writes report.html and demo.json 
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,6 +16,7 @@ import cv2
 import numpy as np
 
 from edge.core.cli import OutputError, command_line, write_result, write_whole
+from firmware_bridge.system.terminal import CommandParser, one_line
 from reporting.page import Cell, Figure, Table, mark, render
 from reporting.plot_style import delay_histogram
 from tools.report import figures
@@ -246,7 +246,7 @@ def recorded_artifacts(out: Path) -> Path:
 @command_line("demo_report")
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; exit codes 0 all checks passed, 1 a check failed, 2 bad input."""
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="python -m tools.report.demo_report",
         description="Write the report of a demo run again from its files.",
         epilog="example: python -m tools.report.demo_report out/demo",
@@ -262,7 +262,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         summary = write_report(files, wall_s=wall_s)
         write_result(args.json, summary)
     except (ReportError, OSError) as error:
-        print(f"demo_report: {error}", file=sys.stderr)
+        print(f"demo_report: {one_line(error)}", file=sys.stderr)
         return 2
     if args.json != "-":
         print(files.report)

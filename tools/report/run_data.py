@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.flightlog.reader import RecordingError, jpeg_bytes, read_messages
+from firmware_bridge.system.input_file import read_json
 
 Record = dict[str, Any]
 Array = NDArray[np.float64]
@@ -87,7 +88,7 @@ class RunData:
 def load_json(path: Path) -> Record:
     """Read a JSON object from a file. Raises ReportError that names the file."""
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
+        value = read_json(path)
     except FileNotFoundError:
         raise ReportError(f"{path} is missing; expected the JSON result of the run") from None
     except (OSError, ValueError) as error:

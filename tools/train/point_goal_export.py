@@ -6,8 +6,8 @@ maps frame, velocity and goal to a trajectory and is driven by `edge-bench --pol
 
 from __future__ import annotations
 
-import argparse
 import json
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,9 +18,10 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
-from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, command_line, named_file
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, check_result_target, command_line, named_file
 from export.model.config import ModelConfigError, TicVlaConfig, config_from_dict
 from export.model.vision import VisionEncoder
+from firmware_bridge.system.terminal import CommandParser, one_line
 from sim_hil.benchmark.policies.point_goal_net import FORMAT, KEY
 from tools.train.config.checks import TrainError
 from tools.train.imitate.trainable_policies import PointGoalNet, load_point_goal
@@ -66,12 +67,13 @@ def export(vision: VisionEncoder, net: PointGoalNet, config: TicVlaConfig, path:
 @command_line("point_goal_export")
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command and return its exit code."""
-    p = argparse.ArgumentParser("point_goal_export", description=__doc__.split("\n")[0])
+    p = CommandParser("point_goal_export", description=__doc__.split("\n")[0])
     p.add_argument("weights", type=Path, metavar="FILE", help="point_goal.safetensors of a run's imitate or rl stage")
     p.add_argument("--out", type=Path, required=True, metavar="FILE.onnx", help="ONNX file to write")
     args = p.parse_args(argv)
     try:
-        run = args.weights.resolve().parent.parent
+        check_result_target(str(args.out), "--out")
+        run = Path(os.path.realpath(args.weights)).parent.parent
         before = weights_before(run, "imitate")
         if before is None:
             raise TrainError(f"{run}: no encoder weights found; expected FILE inside a run folder of edge-train")
@@ -81,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         net = load_point_goal(args.weights, config)
         export(network.vision, net, config, args.out, args.weights.parent.name)
     except (OSError, SafetensorError, KeyError, ModelConfigError, TrainError) as error:
-        sys.stderr.write(f"point_goal_export: {error}\n")
+        sys.stderr.write(f"point_goal_export: {one_line(error)}\n")
         return EXIT_BAD_INPUT
     return EXIT_DONE
 

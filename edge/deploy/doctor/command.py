@@ -45,6 +45,7 @@ from edge.inference.graph import GraphError
 from edge.power.governor.plan import PowerPlan, read_power_plan
 from edge.power.meters.select import open_meter
 from firmware_bridge.core.config import ConfigError, RobotConfig, load_robot_config
+from firmware_bridge.system.terminal import CommandParser
 
 if TYPE_CHECKING:
     from edge.inference.policy import Policy  # needs ONNX Runtime
@@ -70,7 +71,7 @@ T = TypeVar("T")
 
 def parser() -> argparse.ArgumentParser:
     """Command line of `edge-doctor`."""
-    p = argparse.ArgumentParser(
+    p = CommandParser(
         "edge-doctor", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     p.add_argument("--artifacts", type=Path, metavar="DIR", help="directory made by edge-export")
@@ -184,6 +185,8 @@ def _machine(
     else:
         yield doctor_machine.match(facts, wanted, platform.machine(), available_providers(), root)
         yield doctor_machine.power_mode(facts.power_mode, root, _nvpmodel)
+        yield doctor_machine.boot_power_mode(facts.power_mode, root)
+    yield doctor_machine.hardware_watchdog(root)
     yield doctor_machine.clocks(root)
     yield doctor_machine.cpu_governor(root)
     yield doctor_machine.memory(plan, root, own_memory=facts is not None and facts.own_memory)

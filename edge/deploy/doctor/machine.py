@@ -12,6 +12,7 @@ from typing import Final
 from edge.artifacts.target_facts import GIB, PlanFacts, TargetFacts
 from edge.core.device import DeviceError, check_power_mode, l4t_release
 from edge.core.sysfs import read_int
+from edge.deploy import boot
 from edge.deploy.doctor.check import Check, Level, skipped
 from edge.flightlog.recorder import ARMING_FREE_SHARE
 
@@ -66,6 +67,29 @@ def power_mode(wanted: str, root: Path, query: Query) -> Check:
         found = f"nvpmodel reports {wanted}, but cores {_listed(online)} are online"
         return Check(name, Level.FAIL, found, f"cores {_listed(required)}", "reboot: a mode applies at start-up only")
     return Check(name, Level.OK, wanted, wanted)
+
+
+def boot_power_mode(wanted: str, root: Path) -> Check:
+    """Check the power mode in which the board will start the next time."""
+    name, found = "power mode at start-up", boot.stored_mode(root)
+    if found is None:
+        return skipped(name, "no stored mode of nvpmodel, so this is no Jetson")
+    if found == wanted:
+        return Check(name, Level.OK, found, wanted)
+    return Check(name, Level.WARN, found, wanted, f"sudo edge-install boot --power-mode {wanted}")
+
+
+def hardware_watchdog(root: Path) -> Check:
+    """Check that a kernel that hangs is reset: systemd feeds the processor's watchdog."""
+    name, wanted = "hardware watchdog", "active: a kernel that hangs is reset"
+    state = _text(root / "sys/class/watchdog/watchdog0/state")
+    if state == "active":
+        return Check(name, Level.OK, f"active, {_text(root / 'sys/class/watchdog/watchdog0/timeout')} s", wanted)
+    if not state and not (root / "dev/watchdog0").exists():
+        return Check(
+            name, Level.WARN, "none, or its driver is not loaded", wanted, "load the driver of the board's watchdog"
+        )
+    return Check(name, Level.WARN, "not active", wanted, "sudo edge-install boot --watchdog 30, then restart")
 
 
 def mode_cores(conf: str, mode: str) -> set[int]:

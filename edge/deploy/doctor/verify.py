@@ -16,12 +16,13 @@ from edge.core.cli import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_REFUSED, command_li
 from edge.deploy.doctor.check import Level
 from edge.deploy.doctor.graphs import profile_graph, self_test
 from edge.inference import engines
+from firmware_bridge.system.terminal import CommandParser, one_line
 
 
 @command_line("edge-export")
 def main(argv: Sequence[str] | None = None) -> int:
     """Verify an artifact directory without torch; returns the exit code."""
-    parser = argparse.ArgumentParser("edge-export", description=__doc__)
+    parser = CommandParser("edge-export", description=__doc__)
     parser.add_argument("verify", choices=["verify"], help=argparse.SUPPRESS)
     parser.add_argument("directory", type=Path, metavar="DIR", help="artifact directory")
     args = parser.parse_args(argv)
@@ -32,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             engines.check(artifacts, folder)
             artifacts = engines.with_engines(artifacts, folder)
     except (ArtifactError, engines.EngineError) as error:
-        sys.stderr.write(f"edge-export: {error}\n")
+        sys.stderr.write(f"edge-export: {one_line(error)}\n")
         return EXIT_REFUSED
     checks = [self_test(artifacts)[0]]
     if checks[0].level is not Level.FAIL:  # a graph that fails may also loop

@@ -83,10 +83,11 @@ def judge(flight: Flight, event: Event) -> Verdict:
         return Verdict(UNEXPLAINED, "the log has no tick of this time")
     if event.kind == STOP:
         return _of_stop(flight, event, ticks)
+    with_person = event.kind == COLLISION and "person" in event.detail
     chain = (
         _odometry(flight, ticks[-1]),
-        _person(flight, event, ticks) if event.kind == COLLISION and "person" in event.detail else None,
-        _texts(flight, event, ticks[-1]),
+        # A route that leads elsewhere is no reason to walk into a person.
+        _person(flight, event, ticks) if with_person else _texts(flight, event, ticks[-1]),
         _plan_against_text(flight, ticks),
         _command(flight, ticks),
         _execution(flight, ticks),

@@ -32,6 +32,7 @@ from edge.flightlog.replay.records import RecordedRun, RecordedTick, read_events
 from edge.inference import engines
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
+from firmware_bridge.system.terminal import CommandParser
 
 EXAMPLES = """examples:
   edge-replay flight.mcap --artifacts out/nano
@@ -69,12 +70,13 @@ class Tolerance:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not (math.isfinite(value) and value >= 0):
-                raise OptionError(f"--tolerance of {name}: expected 0 or more, found {value}")
+                option = f"--tolerance-{name.rpartition('_')[2]}"
+                raise OptionError(f"{option}: expected a finite number, 0 or more, found {value}")
 
 
 def parser() -> argparse.ArgumentParser:
     """Command line of `edge-replay`."""
-    p = argparse.ArgumentParser(
+    p = CommandParser(
         "edge-replay", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     p.add_argument("file", type=Path, metavar="FILE.mcap", help="flight log of edge-run --record")

@@ -14,8 +14,8 @@ from pathlib import Path
 
 from tokenizers import AddedToken, Regex, Tokenizer, decoders, models, pre_tokenizers, trainers
 
-from export.core.typed import tomllib
 from export.model.config import PRESETS
+from firmware_bridge.system.input_file import read_toml
 
 NANO_TOKENIZER = Path(__file__).with_name("nano_tokenizer.json")
 NANO_WORDS = Path(__file__).with_name("nano_words.toml")
@@ -43,7 +43,7 @@ _SPLIT = pre_tokenizers.Sequence(
 
 def word_lists() -> dict[str, list[str]]:
     """Read the words of `nano_words.toml` by list, each once, in the file's order."""
-    data = tomllib.loads(NANO_WORDS.read_text(encoding="utf-8"))
+    data = read_toml(NANO_WORDS)
     return {key: list(dict.fromkeys(text.replace(",", " ").split())) for key, text in data.items()}
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from edge.state.switches import Decoding, RecoverySwitch, SwitchOptions
+from edge.state.switches import Switches, SwitchOptions
 from sim_hil.benchmark.conditions.latency import LatencyError, LatencyProfile
 from sim_hil.realtime.robots import GO2, ROBOTS
 from sim_hil.robots.odometry_noise import LEVELS
@@ -85,6 +85,8 @@ class Conditions:
     """Decoding of an artifact policy's texts; None: the manifest's."""
     recovery: str | None = None
     """Whether recoveries may replace an artifact policy's commands; None: the manifest's."""
+    speculation: str | None = None
+    """Whether an artifact policy's calls verify guessed tokens, which changes no text; None: the manifest's."""
     stays: bool = False
     """Whether an artifact policy halts at the stop that its texts give; otherwise only the goal ends an episode."""
     camera: str = "auto"
@@ -114,7 +116,7 @@ class Conditions:
             raise ConditionsError(
                 f"mode: expected one for artifacts:DIR and for no other policy, found {self.mode} with {kind}"
             )
-        for name, requested in (("stay", self.stays), ("decoding", self.decoding), ("recovery", self.recovery)):
+        for name, requested in (("stay", self.stays), *self._switches_by_name):
             if requested and kind != "artifacts":
                 raise ConditionsError(f"{name}: expected only with artifacts:DIR, found with {kind}")
         try:
@@ -140,13 +142,20 @@ class Conditions:
     @property
     def switches(self) -> SwitchOptions:
         """Decoding rules and recoveries requested of a policy from artifacts."""
-        return SwitchOptions.parse(self.decoding, self.recovery, self.stays)
+        return SwitchOptions.parse(self.decoding, self.recovery, self.stays, self.speculation)
 
-    def with_defaults_of(self, decoding: Decoding, recovery: RecoverySwitch) -> Conditions:
+    @property
+    def _switches_by_name(self) -> tuple[tuple[str, str | None], ...]:
+        return ("decoding", self.decoding), ("recovery", self.recovery), ("speculation", self.speculation)
+
+    def with_defaults_of(self, defaults: Switches) -> Conditions:
         """Return these conditions with a manifest's defaults where they leave a switch open. Raises ConditionsError."""
         return replace(
-            self, decoding=self.decoding or decoding.value, recovery=self.recovery or recovery.value
-        )  # fmt: skip
+            self,
+            decoding=self.decoding or defaults.decoding.value,
+            recovery=self.recovery or defaults.recovery.value,
+            speculation=self.speculation or defaults.speculation.value,
+        )
 
     @property
     def camera_size(self) -> tuple[int, int] | None:
@@ -193,9 +202,7 @@ class Conditions:
             parts.append(f"{self.wordings} wordings")
         if self.swap_instructions is not None:
             parts.append(f"instructions swapped by {self.swap_instructions}")
-        parts += [
-            f"{name} {value}" for name, value in (("decoding", self.decoding), ("recovery", self.recovery)) if value
-        ]
+        parts += [f"{name} {value}" for name, value in self._switches_by_name if value]
         if self.stays:
             parts.append("halts at its own stop")
         return ", ".join([*parts, f"drift {self.drift}"])

@@ -32,7 +32,7 @@ from edge.state.frame import Frame, fit_frame
 from edge.state.pose_history import PoseHistory, StampedPose
 from edge.state.ring import TokenRing
 from edge.state.semantic import SemanticSlot, SemanticState, SharedState
-from edge.state.switches import Switches, SwitchOptions
+from edge.state.switches import Speculation, Switches, SwitchOptions
 from firmware_bridge.client import BridgeStatus
 from firmware_bridge.core.config import RobotConfig
 from sim_hil.benchmark.conditions.conditions import ConditionsError
@@ -69,9 +69,11 @@ class ArtifactsPolicy:
         check_suits(self._artifacts, mode)
         self._mode, self._latency, self._robot = Mode(mode), latency, robot
         runtime, asked = self._artifacts.runtime, switches or SwitchOptions()
-        self._switches = asked.over(runtime.decoding, runtime.recovery, stand_at_goal=False)
+        self._switches = asked.over(runtime.switches, stand_at_goal=False)
         self._model = Model(self._artifacts, threads=1)
-        self._language = LanguageModel(self._artifacts, threads=1)
+        self.language = LanguageModel(self._artifacts, threads=1)
+        if self._switches.speculation is Speculation.ON:
+            self.language.speculate()
         self._drive: _Drive | None = None
         self.recorder: RecordSink | None = None
         """Takes the records of the next episode and its pictures."""
@@ -89,10 +91,10 @@ class ArtifactsPolicy:
 
     def reset(self, episode: Episode, instruction: str, world: object | None, seed: int) -> None:
         """Begin an episode without frames and semantic state. Raises InstructionError if the prompt is too long."""
-        self._language.check_instruction(instruction)
+        self.language.check_instruction(instruction)
         draw = LatencySampler(self._latency, seed, episode.id).draw
         self._drive = _Drive(
-            self._artifacts, self._model, self._language, self._robot, self._mode, instruction, draw, self._switches,
+            self._artifacts, self._model, self.language, self._robot, self._mode, instruction, draw, self._switches,
             self.recorder,
         )  # fmt: skip
         if self.recorder is not None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, check_result_target, command_line, write_result
+from firmware_bridge.system.terminal import CommandParser, one_line
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.results.record import ResultError
 from sim_hil.benchmark.results.report import write_report
@@ -30,7 +31,7 @@ _UNITS = {"sr": "SR, points", "spl": "SPL, points", "ne_m": "NE, m", "cr": "CR, 
 @command_line("edge-bench")
 def main(argv: Sequence[str]) -> int:
     """Run the command and return its exit code; `argv` includes the sub-command's name."""
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         "edge-bench", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     jobs = parser.add_subparsers(dest="job", required=True)
@@ -51,7 +52,7 @@ def main(argv: Sequence[str]) -> int:
             sys.stdout.write(_lines(result))
         return EXIT_DONE
     except (StoreError, ConditionsError, ResultError, OSError) as error:
-        sys.stderr.write(f"edge-bench {args.job}: {error}\n")
+        sys.stderr.write(f"edge-bench {args.job}: {one_line(error)}\n")
         return EXIT_BAD_INPUT
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from edge.core.cli import write_whole
 from edge.core.geometry import SE2
 from edge.core.stats import percentiles
+from firmware_bridge.system.input_file import read_json
 
 DELAY_POINTS = ("mean", "p50", "p99", "max")
 COLUMNS = ("time_s", "x_m", "y_m", "theta_rad", "odom_x_m", "odom_y_m", "vx_mps", "vy_mps", "wz_radps", "delay_s")
@@ -166,7 +167,7 @@ class EpisodeLog:
 
 def read_log(path: Path) -> dict[str, Any]:
     """Read a log written by `EpisodeLog.write`. Raises OSError or ValueError."""
-    content = json.loads(path.read_text(encoding="utf-8"))
+    content = read_json(path)
     if not isinstance(content, dict) or set(content) != {"columns", "generations", "people", "goal_xy"}:
         raise ValueError(f"{path}: expected the log of an episode")
     if set(content["columns"]) != set(COLUMNS):

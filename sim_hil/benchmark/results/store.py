@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from edge.core.cli import write_whole
+from firmware_bridge.system.input_file import read_json
 from sim_hil.benchmark.results.record import EpisodeResult, FailedRun, ResultError
 
 CONFIG, RESULTS, FAILED = "config.json", "results.jsonl", "failed.jsonl"
@@ -114,7 +115,7 @@ def read_config(directory: Path) -> dict[str, Any]:
     """Read the configuration of a run. Raises StoreError."""
     path = directory / CONFIG
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
     except (OSError, ValueError) as error:
         raise StoreError(f"{path}: expected the configuration of a benchmark run ({error})") from error
     if not isinstance(content, dict):

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from edge.core.cli import command_line, write_named
+from firmware_bridge.system.terminal import CommandParser
 from sim_hil.benchmark.language.instruction_reading import untrue
 from sim_hil.benchmark.language.instructions import WordingError, wordings
 from sim_hil.benchmark.language.route import RouteError
@@ -201,7 +202,7 @@ def _print_progress(line: str) -> None:
 @command_line("build_suite")
 def main(argv: list[str] | None = None) -> int:
     """Write or check the suite file; return the exit code."""
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="python -m sim_hil.benchmark.suite.build", description="Build the DynaNav suite from its scenes.",
         epilog="example: python -m sim_hil.benchmark.suite.build --out sim_hil/benchmark/suite/suites/dynanav.toml",
         formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -6,7 +6,6 @@ timeout (paper appendix C: "share the same semantic objective but differ in crow
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import degrees, hypot, isfinite, radians
@@ -15,12 +14,8 @@ from typing import Any
 
 import tomli_w
 
+from firmware_bridge.system.input_file import parse_toml, read_text
 from sim_hil.scene.table import Table
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 SUITES = Path(__file__).with_name("suites")
 ROBOTS = ("go2", "carter")
@@ -121,7 +116,7 @@ def _task(table: Table) -> list[Episode]:
 def parse_suite(text: str, source: str) -> tuple[Episode, ...]:
     """Parse a suite's TOML text into episodes, in the file's order; `source` names it in errors. Raises SuiteError."""
     try:
-        table = Table("suite", tomllib.loads(text), SuiteError)
+        table = Table("suite", parse_toml(text), SuiteError)
         if (found := table.whole("format")) != FORMAT:
             raise SuiteError(f"format {FORMAT} expected, found {found}")
         table.text("name")
@@ -130,9 +125,7 @@ def parse_suite(text: str, source: str) -> tuple[Episode, ...]:
         table.done()
         if not episodes:
             raise SuiteError("expected [[tasks]] with [[tasks.episodes]], found none")
-    except tomllib.TOMLDecodeError as error:
-        raise SuiteError(f"{source}: not valid TOML: {error}") from error
-    except SuiteError as error:
+    except ValueError as error:  # of the parser, and SuiteError
         raise SuiteError(f"{source}: {error}") from error
     return tuple(episodes)
 
@@ -151,7 +144,7 @@ def load_suite(name_or_path: str | Path) -> tuple[Episode, ...]:
             raise SuiteError(f"unknown suite {str(name_or_path)!r}, expected one of {known}, or a .toml file")
         path = SUITES / f"{name_or_path}.toml"
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
     except (OSError, UnicodeDecodeError) as error:
         raise SuiteError(f"{path}: cannot be read: {error}") from error
     episodes = parse_suite(text, path.name)

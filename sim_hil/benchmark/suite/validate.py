@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 from edge.core.cli import check_result_target, command_line, write_result
+from firmware_bridge.system.terminal import CommandParser, one_line
 from sim_hil.benchmark.language.instruction_reading import untrue
 from sim_hil.benchmark.language.instructions import is_held_out
 from sim_hil.benchmark.language.route import RouteError, describe_route
@@ -147,7 +148,7 @@ def validate(episodes: Sequence[Episode]) -> dict[str, list[str]]:
 @command_line("validate")
 def main(argv: list[str] | None = None) -> int:
     """Run the command and return its exit code."""
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="python -m sim_hil.benchmark.suite.validate",
         description="Check that a suite's episodes are feasible and their instructions are true.",
         epilog=_EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -162,7 +163,7 @@ def main(argv: list[str] | None = None) -> int:
         episodes = load_suite(args.suite)
         wrong = validate(episodes)
     except (SuiteError, SceneError, OSError) as error:
-        sys.stderr.write(f"{error}\n")
+        sys.stderr.write(f"edge-bench validate: {one_line(error)}\n")
         return 2
     result = {
         "suite": args.suite,

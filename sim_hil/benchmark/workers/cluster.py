@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import socket
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -27,12 +28,29 @@ from sim_hil.benchmark.workers.task import EpisodeTask
 ATTEMPTS = 4
 """Attempts per episode; more than locally, because a dying node ends its episodes regardless of their content."""
 CPUS_PER_EPISODE = 1
+REACH_S = 5.0
+"""Longest time for a connection to the cluster's head, s."""
 NO_PROCESSOR_S = 60.0
 """Longest time without any processor in the cluster, s; a restarting node is back by then."""
 
 
 class ClusterError(RuntimeError):
     """No cluster, or no processor in it; one line."""
+
+
+def _check_reachable(address: str) -> None:
+    """Raise ClusterError where nothing listens: Ray would try for a minute and print its own log."""
+    host, _, port = address.rpartition(":")
+    if not port.isdecimal():
+        return  # `auto` and the like, which only tests use
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), REACH_S).close()
+    except (OSError, UnicodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+        raise ClusterError(
+            f"--cluster {address}: no Ray cluster there ({reason}); start one with `ray start --head`, and run this on "
+            "one of its nodes"
+        ) from error
 
 
 class ClusterJobs:
@@ -60,6 +78,7 @@ class ClusterJobs:
                 "--cluster: needs the packages of the extra 'cluster': pip install 'tic-vla-edge[cluster]'"
             ) from error
         self._ray: Any = ray
+        _check_reachable(address)
         try:
             ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False, configure_logging=False)
         except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:

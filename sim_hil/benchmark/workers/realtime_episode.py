@@ -6,7 +6,6 @@ reproducible.
 
 from __future__ import annotations
 
-import json
 import shutil
 import signal
 import threading
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 
 from edge.core.geometry import SE2
 from edge.flightlog.reader import RecordingError, read_messages
+from firmware_bridge.system.input_file import read_json
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.conditions.variants import artifact_directory
 from sim_hil.benchmark.env.metrics import FRAME_HZ, is_success, measure
@@ -232,7 +232,7 @@ def _last_people(trace: Path) -> NDArray[np.float64]:
 
 def _json(path: Path) -> dict[str, Any]:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
     except (OSError, ValueError):
         return {}
     return content if isinstance(content, dict) else {}

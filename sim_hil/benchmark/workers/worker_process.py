@@ -6,7 +6,6 @@ output.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import sys
@@ -17,6 +16,7 @@ from typing import Any
 
 import cv2
 
+from firmware_bridge.system.terminal import CommandParser
 from sim_hil.processes.child_process import Message, end_with_parent, write_message
 
 Send = Callable[[Mapping[str, Any]], None]
@@ -32,7 +32,7 @@ SINGLE_THREADED: Mapping[str, str] = {
 @contextmanager
 def line_to_parent(prog: str, argv: Sequence[str] | None = None) -> Iterator[Send]:
     """Become the worker that the command line describes; yields a function that sends one message to the parent."""
-    parser = argparse.ArgumentParser(prog=prog)
+    parser = CommandParser(prog=prog)
     parser.add_argument("--fd", type=int, required=True, metavar="N", help="descriptor that lines are written to")
     parser.add_argument("--parent", type=int, required=True, metavar="PID", help="end with this process")
     args = parser.parse_args(argv)

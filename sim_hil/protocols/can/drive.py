@@ -19,6 +19,7 @@ from edge.core.cli import (
 )
 from firmware_bridge.can.buses import BusAddress, BusError, open_bus
 from firmware_bridge.core.config_can import INTERFACES
+from firmware_bridge.system.terminal import CommandParser
 from sim_hil.protocols.can import frames
 from sim_hil.protocols.can.buses import BusLink
 from sim_hil.protocols.can.client import CanClient, Odometry
@@ -38,7 +39,7 @@ class DriveError(RuntimeError):
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="python -m sim_hil.protocols.can.drive",
         description="Arm a Carter over CAN, drive it for a while, stop it.",
         epilog=EPILOG,

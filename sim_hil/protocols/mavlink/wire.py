@@ -15,6 +15,8 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import common
 
+from firmware_bridge.system.input_file import read_text
+
 Message = Any
 """One of pymavlink's message objects: fields as attributes, `get_msgId()`, `get_srcSystem()`."""
 
@@ -125,9 +127,12 @@ def now_ticks() -> int:
     return (time.time_ns() - EPOCH_UNIX_S * 1_000_000_000) * TICKS_PER_S // 1_000_000_000
 
 
+MAX_KEY_FILE_BYTES: Final = 1000
+
+
 def read_key(path: Path) -> bytes:
     """Read the secret key, 64 hexadecimal digits in a file. Raises ValueError or OSError."""
-    text = path.read_text(encoding="ascii").strip()
+    text = read_text(path, MAX_KEY_FILE_BYTES).strip()
     try:
         key = bytes.fromhex(text)
     except ValueError:

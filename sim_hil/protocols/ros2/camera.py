@@ -7,7 +7,6 @@ the parent has gone. Without a subscriber nothing is rendered.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import signal
 import sys
@@ -20,6 +19,7 @@ from firmware_bridge.core.config import DdsConfig
 from firmware_bridge.dds.binding import has_reader
 from firmware_bridge.dds.bus import DDS_ERRORS, Bus
 from firmware_bridge.ros2.messages.sensors import CameraInfo_, CompressedImage_
+from firmware_bridge.system.terminal import CommandParser
 from sim_hil.processes.child_process import input_is_open, take_standard_output, write_message
 from sim_hil.protocols.render_process import encode_jpeg
 from sim_hil.protocols.ros2.topics import CAMERA_FRAME, CAMERA_INFO_TOPIC, IMAGE_TOPIC, camera_info, header
@@ -76,7 +76,7 @@ def _publish_while_parent_lives(node: CameraNode, size: tuple[int, int], pipe: T
 
 def main(argv: list[str] | None = None) -> int:
     """Run the camera process until stdin closes."""
-    parser = argparse.ArgumentParser(prog="edge-hil camera", description="started by edge-hil")
+    parser = CommandParser(prog="edge-hil camera", description="started by edge-hil")
     for name in ("scene", "interface"):
         parser.add_argument(f"--{name}", required=True)
     parser.add_argument("--peer", action="append", default=[])

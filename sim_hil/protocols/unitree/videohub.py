@@ -7,7 +7,6 @@ gone.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import functools
 import signal
@@ -16,6 +15,7 @@ from typing import Final
 
 from firmware_bridge.core.config import DdsConfig
 from firmware_bridge.dds.bus import Bus
+from firmware_bridge.system.terminal import CommandParser
 from firmware_bridge.unitree.messages import ids
 from sim_hil.processes.child_process import input_is_open, take_standard_output, write_message
 from sim_hil.protocols.render_process import encode_jpeg
@@ -32,7 +32,7 @@ _FAULTS_CHECK_NS: Final = 5_000_000  # a fault takes effect, and a held answer l
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point of the camera process; ends when stdin does."""
-    parser = argparse.ArgumentParser(prog="edge-hil camera", description="started by edge-hil")
+    parser = CommandParser(prog="edge-hil camera", description="started by edge-hil")
     parser.add_argument("--scene", required=True)
     parser.add_argument("--people", type=int, required=True)
     parser.add_argument("--seed", type=int, required=True)

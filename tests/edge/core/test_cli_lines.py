@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from edge.core.cli import EXIT_CHECK_FAILED, command_line, describe_os_error, messages, printable
+from edge.core.cli import EXIT_CHECK_FAILED, command_line, describe_os_error, messages
+from firmware_bridge.system.terminal import one_line
 
 
 @pytest.mark.parametrize(
@@ -20,13 +21,13 @@ from edge.core.cli import EXIT_CHECK_FAILED, command_line, describe_os_error, me
         ("\x1b]0;title\x07weights", r"\x1b]0;title\x07weights"),
         ("a\x9b2Jb", r"a\x9b2Jb"),
         ("\ud800", r"\ud800"),
-        ("cosine ≥ 0.99, 90°\n\tnext", "cosine ≥ 0.99, 90°\n\tnext"),
+        ("cosine ≥ 0.99, 90°\n\tnext", r"cosine ≥ 0.99, 90°\n\tnext"),
     ],
 )
 def test_control_characters_of_a_name_never_reach_the_terminal(
     text: str, shown: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert printable(text) == shown
+    assert one_line(text) == shown
     messages("edge-x")(text)
     assert capsys.readouterr().err == f"edge-x: {shown}\n"
 

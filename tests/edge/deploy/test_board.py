@@ -382,7 +382,7 @@ def test_the_real_command_installs_this_package_and_its_runner_starts(
     subprocess.run([*pip, "--no-build-isolation", REPOSITORY], check=True)
     (wheel,) = tmp_path.glob("*.whl")
     words = ["--home", str(tmp_path / "home"), "--wheel", str(wheel), "--artifacts", str(artifacts_dir)]
-    code = main(["board", *words, "--constraints", str(REPOSITORY / "constraints.txt")])
+    code = main(["board", *words])
     output = capfd.readouterr().err
     if code != EXIT_DONE and "name resolution" in output:
         pytest.skip("no package index here")

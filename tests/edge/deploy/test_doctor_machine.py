@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import datetime
 import io
 from dataclasses import replace
@@ -12,14 +13,17 @@ from rich.console import Console
 
 from edge.artifacts.target_facts import GIB, PlanFacts, TargetFacts
 from edge.core.device import CUDA
+from edge.deploy import boot
 from edge.deploy.doctor.check import Check, Level, failed, skipped, table
 from edge.deploy.doctor.link import cable
 from edge.deploy.doctor.machine import (
+    boot_power_mode,
     busy_programs,
     clocks,
     core_numbers,
     cpu_governor,
     disk,
+    hardware_watchdog,
     match,
     memory,
     power_mode,
@@ -269,3 +273,84 @@ def test_every_setting_that_lets_others_reach_the_robot_is_found(
 
 def test_a_simulated_robot_has_no_cable(tmp_path: Path) -> None:
     assert cable("lo", tmp_path).level is Level.SKIP
+
+
+# --- the next start
+
+BOOT_CONF = "< POWER_MODEL ID=0 NAME=MAXN >\nCPU_ONLINE CORE_0 1\n< POWER_MODEL ID=2 NAME=25W >\n"
+
+
+@pytest.fixture
+def board(tmp_path: Path) -> Path:
+    """Files of a Jetson with a watchdog, which starts in MAXN."""
+    for folder in ("etc", "dev", "var/lib/nvpmodel", "sys/class/watchdog/watchdog0"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "etc/nvpmodel.conf").write_text(BOOT_CONF)
+    (tmp_path / "var/lib/nvpmodel/status").write_text("pmode:0000\nfmode:quiet\n")
+    (tmp_path / "dev/watchdog0").touch()
+    (tmp_path / "sys/class/watchdog/watchdog0/state").write_text("inactive\n")
+    return tmp_path
+
+
+def setting(board: Path, lines: list[str], ran: list[list[str]], **values: object) -> int:
+    args = argparse.Namespace(**{"watchdog": None, "power_mode": None, "dry_run": False, **values})
+
+    def command(words: list[str]) -> tuple[int, str]:
+        ran.append(list(words))
+        return 0, ""
+
+    return boot.run(args, lines.append, board, command)  # type: ignore[arg-type]
+
+
+def test_the_watchdog_is_written_for_systemd(board: Path) -> None:
+    assert setting(board, [], [], watchdog=30) == 0
+    assert "[Manager]\nRuntimeWatchdogSec=30\n" in (board / boot.WATCHDOG_FILE).read_text()
+
+
+def test_the_power_mode_is_stored_by_its_number(board: Path) -> None:
+    ran: list[list[str]] = []
+    assert setting(board, [], ran, power_mode="25W") == 0 and ran == [["nvpmodel", "-m", "2"]]
+
+
+def test_a_dry_run_changes_nothing(board: Path) -> None:
+    ran: list[list[str]] = []
+    assert setting(board, [], ran, watchdog=30, power_mode="25W", dry_run=True) == 0
+    assert not (board / boot.WATCHDOG_FILE).exists() and ran == []
+
+
+@pytest.mark.parametrize(("values", "said"), [
+    ({}, "expected --watchdog S"), ({"watchdog": 0}, "expected 5 to 120 s"), ({"watchdog": 10**9}, "5 to 120 s"),
+    ({"power_mode": "99W"}, "MAXN, 25W"),
+])  # fmt: skip
+def test_what_cannot_be_set_is_one_line_and_changes_nothing(board: Path, values: dict[str, object], said: str) -> None:
+    lines: list[str] = []
+    ran: list[list[str]] = []
+    assert setting(board, lines, ran, **values) == 2
+    assert len(lines) == 1 and said in lines[0] and ran == [] and not (board / boot.WATCHDOG_FILE).exists()
+
+
+def test_a_machine_without_a_watchdog_is_told(board: Path) -> None:
+    (board / "dev/watchdog0").unlink()
+    lines: list[str] = []
+    assert setting(board, lines, [], watchdog=30) == 2 and "no hardware watchdog" in lines[0]
+
+
+def test_the_doctor_tells_a_watchdog_that_is_not_active(board: Path) -> None:
+    found = hardware_watchdog(board)
+    assert found.level is Level.WARN and "edge-install boot --watchdog" in found.advice
+
+
+def test_the_doctor_is_content_with_an_active_watchdog(board: Path) -> None:
+    (board / "sys/class/watchdog/watchdog0/state").write_text("active\n")
+    (board / "sys/class/watchdog/watchdog0/timeout").write_text("30\n")
+    assert hardware_watchdog(board).level is Level.OK
+
+
+def test_the_doctor_tells_another_power_mode_at_start_up(board: Path) -> None:
+    found = boot_power_mode("25W", board)
+    assert (found.level, found.found) == (Level.WARN, "MAXN") and "edge-install boot --power-mode 25W" in found.advice
+
+
+def test_the_doctor_is_content_with_the_stored_power_mode(board: Path) -> None:
+    (board / "var/lib/nvpmodel/status").write_text("pmode:0002\n")
+    assert boot_power_mode("25W", board).level is Level.OK

@@ -39,10 +39,11 @@ def test_the_exported_model_generates_the_same_text_as_pytorch(artifacts: Artifa
     with torch.no_grad():
         while len(new) < 12:
             past = [torch.zeros(1, c.kv_heads, 0, c.head_dim) for _ in range(2 * c.layers)]
-            token, _, kv, *_ = model.language(torch.tensor([ids + new]), tokens, past)
-            if int(token) == c.im_end_id:
+            chosen, _, kv, *_ = model.language(torch.tensor([ids + new]), tokens, past)
+            token = int(chosen[0, -1])
+            if token == c.im_end_id:
                 break
-            new.append(int(token))
+            new.append(token)
     assert found.token_ids == tuple(new)
     tokenizer = Tokenizer.from_buffer(artifacts.contents["tokenizer.json"])
     assert found.text == tokenizer.decode(new, skip_special_tokens=True)

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 from edge.artifacts.manifest import Artifacts, load_artifacts
 from edge.core.geometry import SE2
+from edge.inference.calls import Chunk, chunks, set_last_apart
 from edge.inference.graph import CancelledError, Interrupt
-from edge.inference.language import Chunk, ContextOverflowError, LanguageModel, chunks, set_last_apart
+from edge.inference.language import ContextOverflowError, LanguageModel
 from edge.reasoning.prompt import Segment
 from edge.state.ring import EncodedFrame
 
@@ -87,6 +88,30 @@ def test_any_chunk_length_gives_the_same_answer(
     assert generation.token_ids == expected[1]
 
 
+@pytest.mark.parametrize("directory", ["artifacts", pytest.param("pair", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("before", [SENTENCE, "go to the door", SENTENCE * 3], ids=["same", "other", "longer"])
+def test_rows_kept_from_the_previous_generation_have_the_bits_of_computed_ones(
+    request: pytest.FixtureRequest, directory: str, before: str
+) -> None:
+    fresh, used = (model(request.getfixturevalue(directory), 16) for _ in range(2))
+    used.generate(used.prompt.build(frames(2, 64, 256, 5), before), max_new_tokens=9, cancelled=lambda: False)
+    found, expected = (
+        each.generate(each.prompt.build(frames(4, 64, 256), SENTENCE), max_new_tokens=12, cancelled=lambda: False)
+        for each in (used, fresh)
+    )
+    np.testing.assert_array_equal(found.last_layer_kv, expected.last_layer_kv)
+    assert found.token_ids == expected.token_ids
+
+
+def test_rows_of_an_interrupted_call_are_not_kept(artifacts: Artifacts) -> None:
+    language = model(artifacts, 16)
+    interrupt = Interrupt()
+    run = language.begin(lambda: False, interrupt=interrupt, before_call=lambda _: interrupt.set())
+    with pytest.raises(CancelledError):
+        run.feed(language.prompt.build(frames(1, 64, 256), SENTENCE)[:1])
+    assert language.kept_ids == ()
+
+
 def test_a_generations_keys_and_values_survive_the_next_generation(artifacts: Artifacts) -> None:
     language = model(artifacts, 64)
     first = language.generate(
@@ -138,7 +163,8 @@ def test_every_call_is_announced_with_its_last_duration(artifacts: Artifacts) ->
         announced.append([])
         language.begin(lambda: False, before_call=announced[-1].append).finish(segments, max_new_tokens=2)
     assert announced[0][0] == 0
-    assert len(announced[1]) == len(announced[0]) > 2 and min(announced[1]) > 0
+    assert len(announced[1]) == len(announced[0]) - 1 > 2, "the second one keeps the text before the first frame"
+    assert min(announced[1]) > 0
 
 
 def test_an_interrupt_from_another_thread_ends_a_call_that_is_under_way(artifacts: Artifacts) -> None:

@@ -138,7 +138,7 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
     "special tokens exchanged": (exchange_special, "the prompt's token ids are not the exporter's"),
     "a negative next token": (
         lambda d: edit_graph(d, "language_model", lambda m: replace_output(m, "next_token", "Neg")),
-        r"the graphs do not run \(the language model's next token is -\d+",
+        r"the graphs do not run \(the language model's next tokens are \[-\d+",
     ),
 }  # fmt: skip
 FAST = ("one weight is NaN", "a matrix scaled by 0.99", "two tokens exchanged")
@@ -172,6 +172,26 @@ def test_other_kernels_give_the_exported_answers(artifacts: Artifacts, monkeypat
 
     monkeypatch.setattr(ort, "SessionOptions", without_fusion)
     assert open_proven(artifacts).tested.worst_share < 0.1
+
+
+@pytest.mark.parametrize("output", ["visual_tokens", "last_layer_kv", "trajectory"])
+def test_a_provider_that_computes_wrongly_is_refused(
+    artifacts: Artifacts, monkeypatch: pytest.MonkeyPatch, output: str
+) -> None:
+    real = ort.InferenceSession.run_with_iobinding
+
+    def one_percent_off(session: ort.InferenceSession, binding: ort.IOBinding, options: object = None) -> None:
+        real(session, binding, options)
+        wanted = output in [tensor.name for tensor in session.get_outputs()]
+        for value in binding.get_outputs():
+            if wanted and len(value.shape()) == 3:  # the others are KV buffers and a token
+                value.update_inplace(value.numpy() * np.float32(1.01))
+
+    monkeypatch.setattr(ort.InferenceSession, "run_with_iobinding", one_percent_off)
+    with pytest.raises(
+        ArtifactError, match=r"answers otherwise than at the export: deviation 0\.01, tolerance 0\.0002"
+    ):
+        open_proven(artifacts)
 
 
 def test_a_manifest_without_answers_is_refused(artifacts: Artifacts) -> None:

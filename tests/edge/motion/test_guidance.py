@@ -17,6 +17,7 @@ from edge.inference.policy import Policy
 from edge.inference.warm_up import warm_up
 from edge.state.reasoning_text import Waypoints
 from edge.state.semantic import STRAIGHT_AHEAD, SemanticState, waypoints_now
+from edge.state.switches import Speculation
 from export.model.config import PRESETS
 from export.model.network import build
 from tests.support.artifact_directory import write_artifacts
@@ -79,4 +80,4 @@ def test_a_guided_policy_has_no_plan_without_waypoints(guided: Artifacts) -> Non
 
 
 def test_the_runner_warms_a_guided_policy_up(guided: Artifacts) -> None:
-    warm_up(Policy(guided, threads=1), LanguageModel(guided, threads=1), 128, 2)
+    warm_up(Policy(guided, threads=1), LanguageModel(guided, threads=1), Speculation.ON)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tokenizers import Tokenizer
 
 from edge.artifacts.manifest import Artifacts
-from edge.inference.language import Call, Chunk, LanguageModel
+from edge.inference.language import LanguageModel
 from edge.reasoning.decoding_rules import (
     BACK,
     DONE,
@@ -26,6 +24,7 @@ from edge.reasoning.decoding_rules import (
     allowed_progress,
 )
 from edge.state.reasoning_text import MAX_COUNT, Progress, format_progress, parse_progress
+from tests.support.scripted_model import decode_script
 
 PROGRESS = st.integers(0, 6).flatmap(
     lambda steps: st.one_of(
@@ -164,39 +163,10 @@ def test_a_text_has_a_plan_once_its_line_is_complete(lines: list[str], complete:
 # In the decoding loop
 
 
-class Script:
-    """A decode call that writes the lines of a text, whatever the earlier ones have become; keeps what it was fed."""
-
-    def __init__(self, lines: list[list[int]], prompt: int) -> None:
-        self._lines, self._prompt = lines, prompt
-        self._fed: list[int] = []
-
-    def __call__(self, chunk: Chunk, past: int, kv: object, interrupt: object) -> int:
-        self._fed = [*self._fed[:past], *chunk.ids]
-        ends = {line[-1] for line in self._lines[:-1]}
-        number, place = 0, 0
-        for token in self.answer():
-            number, place = (number + 1, 0) if token in ends else (number, place + 1)
-        line = self._lines[number]
-        return line[min(place, len(line) - 1)]
-
-    def answer(self) -> list[int]:
-        """Tokens fed behind the prompt."""
-        return self._fed[self._prompt :]
-
-
 def decode(artifacts: Artifacts, text: str, context: DecodingContext) -> tuple[str, TextConstraint]:
     """Return the decoded text and its constraint, of a model that would write `text`."""
     language = LanguageModel(artifacts, threads=1)
-    tail = language.prompt.tail((), context.before)
-    tokenizer = Tokenizer.from_buffer(artifacts.contents["tokenizer.json"])
-    lines = [tokenizer.encode(line, add_special_tokens=False).ids for line in text.splitlines(keepends=True)]
-    script = Script([*lines[:-1], [*lines[-1], language.runtime.im_end_id]], len(tail.ids))
-    language.prefill_call = language.decode_call = cast("Call", script)
-    constraint = language.constraint(context)
-    made = language.generate([tail], max_new_tokens=60, cancelled=lambda: False, constraint=constraint)
-    assert made.last_layer_kv.shape[1] == made.prompt_tokens + made.new_tokens
-    assert script.answer() == list(made.token_ids), "the model is fed what was decoded, and that alone"
+    made, constraint = decode_script(language, text, context)
     return made.text, constraint
 
 

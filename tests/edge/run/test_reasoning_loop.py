@@ -209,6 +209,9 @@ class Waiting:
         self.clock, self.waited_ns, self.busy_ns = clock, 0, -1
         self.loop: ReasoningLoop | None = None
 
+    def gap_ns(self) -> float:
+        return 0.0
+
     def wait(self, needs_ns: int, cancelled: Callable[[], bool]) -> None:
         assert self.loop is not None
         self.clock.s += 0.5

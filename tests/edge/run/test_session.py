@@ -15,12 +15,14 @@ import pytest
 
 from edge.core.deadline import Deadline
 from edge.inference.release import ReleaseDelay
+from edge.inference.warm_up import WarmUp
 from edge.reasoning.generation_cycle import Mode
 from edge.run import assembly
 from edge.run import session as module
 from edge.run.arming import RefusedError, StoppedEarlyError
 from edge.run.assembly import Loops, RunOptions
 from edge.run.session import RunSession
+from edge.state.switches import Switches
 from firmware_bridge.client import BridgeUnavailable
 from firmware_bridge.core.config import load_robot_config
 from tests.support.processes import GO2_SIM
@@ -58,7 +60,7 @@ class Rig:
                 guard=SimpleNamespace(stage=lambda *_: nullcontext()),
             ),
             "schedule_for": lambda _artifacts: SimpleNamespace(notes=(), control=None),
-            "warm_up": lambda *_: 1.0,
+            "warm_up": lambda *_: WarmUp(1.0, ()),
             "check_tick": lambda *_: None,
             "ServiceReporter": lambda *_args, **_named: self,
             "BridgeClient": lambda _path: self,
@@ -77,9 +79,7 @@ class Rig:
             monkeypatch.setattr(module, name, fake)
 
     def run(self, robot: Any = ROBOT, record: Path | None = None) -> dict[str, Any]:
-        runtime = SimpleNamespace(
-            tick_period_ms=100, image_px=32, frame_offsets_s=(1.0, 0.0), decoding="constrained", recovery="on"
-        )
+        runtime = SimpleNamespace(tick_period_ms=100, image_px=32, frame_offsets_s=(1.0, 0.0), switches=Switches())
         artifacts: Any = SimpleNamespace(runtime=runtime, guided_by_waypoints=False, directory=Path("a"))
         options = RunOptions("go", Mode.ASYNC, None, ReleaseDelay(0.0, 0.0, 0), record)
         self.session = RunSession(artifacts, robot, options, lambda _line: None)

@@ -11,7 +11,7 @@ from edge.reasoning.decoding_rules import FREE, DecodingContext, TextConstraint
 from edge.reasoning.instruction_state import InstructionMemory
 from edge.run import command as runner
 from edge.state.ring import EncodedFrame
-from edge.state.switches import Decoding, RecoverySwitch, Switches, SwitchOptions
+from edge.state.switches import Decoding, RecoverySwitch, Speculation, Switches, SwitchOptions
 from firmware_bridge.core.config import ConfigError
 from sim_hil.realtime.robots import GO2
 from tests.support.runner.control_bench import Bench
@@ -27,7 +27,7 @@ def asked(*arguments: str) -> SwitchOptions:
 
 def in_force(*arguments: str, recovery: RecoverySwitch = ON) -> Switches:
     """Over a manifest's defaults."""
-    return asked(*arguments).over(CONSTRAINED, recovery, stand_at_goal=True)
+    return asked(*arguments).over(Switches(CONSTRAINED, recovery, False), stand_at_goal=True)
 
 
 @pytest.mark.parametrize(
@@ -38,6 +38,7 @@ def in_force(*arguments: str, recovery: RecoverySwitch = ON) -> Switches:
         (("--stay",), Switches(CONSTRAINED, ON, True)),
         (("--decoding", "free"), Switches(Decoding.FREE, ON, True)),
         (("--recovery", "off"), Switches(CONSTRAINED, OFF, False)),
+        (("--speculation", "off"), Switches(CONSTRAINED, ON, True, Speculation.OFF)),
         (("--recovery", "off", "--no-stay"), Switches(CONSTRAINED, OFF, False)),
     ],
 )

@@ -30,6 +30,7 @@ from edge.inference.graph import GraphError
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
 from edge.run import command as runner
+from edge.run import session
 from edge.state.reasoning_text import format_waypoints
 from tools.faults.rig import circle
 from tools.faults.rig.switches import Switches
@@ -89,15 +90,23 @@ class Faults:
         self._held: NDArray[np.float32] | None = None
 
     def install(self) -> None:
-        """Replace the methods, for this process only."""
-        _replace(Policy, "act", self._act)
-        _replace(Policy, "encode", self._encode)
-        _replace(LanguageModel, "run", self._language)
-        _replace(LanguageModel, "text_of", self._text)
+        """Replace the methods, for this process only; those of the graphs once the self-test has proven them."""
+        _replace(session, "open_proven", self._open)
         _replace(runner, "load_artifacts", _trained)
         _replace(PartFile, "write", self._disk)
         _replace(PartFile, "sync", self._disk)
         time.time = self._clock(time.time)  # noqa: TID251 - a jump of the date must have no effect
+
+    def _open(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        def open_proven(*args: Any, **kwargs: Any) -> Any:
+            opened = original(*args, **kwargs)
+            _replace(Policy, "act", self._act)
+            _replace(Policy, "encode", self._encode)
+            _replace(LanguageModel, "run", self._language)
+            _replace(LanguageModel, "text_of", self._text)
+            return opened
+
+        return open_proven
 
     def _act(self, original: Callable[..., Any]) -> Callable[..., Any]:
         signature = inspect.signature(original)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
@@ -23,16 +22,12 @@ from export.model.config import (
     model_settings,
     with_overrides,
 )
+from firmware_bridge.system.input_file import read_toml
 from tools.train.config.collect import CollectConfig, DaggerConfig
 from tools.train.config.encoder import EncoderConfig
 from tools.train.config.imitate import ImitateConfig
 from tools.train.config.rl import EvaluateConfig, RlConfig
 from tools.train.config.sft import SftConfig
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 SCHEMA: Final = 1
 FOLDER: Final = Path(__file__).parent / "recipes"
@@ -45,6 +40,8 @@ STAGES: Final[Mapping[str, type]] = {
     "evaluate": EvaluateConfig,
 }
 """Configuration class of each stage."""
+ALL: Final = ("collect", "encoder", "sft", "imitate", "dagger", "rl", "evaluate")
+"""All stages in their order, with `dagger`, which has no table of a stage."""
 _UNAWARE: Final = ("model.action.latency_aware=false", "imitate.inject_delay=false")
 VARIANTS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {
@@ -126,14 +123,10 @@ def load_recipe(name_or_path: str, overrides: Sequence[str] = ()) -> Recipe:
     if path.suffix != ".toml":
         raise RecipeError(f"recipe {name_or_path!r}: expected one of {', '.join(recipe_names())}, or a .toml file")
     try:
-        if path.stat().st_size > MAX_RECIPE_BYTES:
-            raise RecipeError(f"recipe {path}: expected at most {MAX_RECIPE_BYTES} bytes")
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+        tables = read_toml(path, MAX_RECIPE_BYTES)
     except OSError as error:
         raise RecipeError(f"recipe {path}: cannot be read ({error.strerror})") from error
-    except (ValueError, RecursionError) as error:
-        if isinstance(error, RecipeError):
-            raise
+    except ValueError as error:
         raise RecipeError(f"recipe {path}: {error}") from error
     try:
         return recipe_of(tables, overrides)

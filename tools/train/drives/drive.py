@@ -23,6 +23,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from edge.core.geometry import SE2
+from firmware_bridge.system.input_file import read_json
 from tools.train.config.checks import TrainError
 from tools.train.config.collect import TRACE_EVERY
 
@@ -264,7 +265,7 @@ class Dataset:
         """Read the index of a folder; `verify` also checks the hash of every file. Raises TrainError."""
         path = folder / INDEX
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
+            content = read_json(path)
             if content["format"] != FORMAT:
                 raise TrainError(f"{path}: expected format {FORMAT}; collect again")
             entries = tuple(Entry(**entry) for entry in content["drives"])

@@ -22,6 +22,7 @@ from safetensors import SafetensorError, safe_open
 
 from edge.core.cli import write_whole
 from export.core.typed import plain
+from firmware_bridge.system.input_file import read_json
 from sim_hil.benchmark.suite.episode import ROBOTS
 from sim_hil.benchmark.workers.worker_pool import WorkerEvent, WorkerJob, Workers
 from tools.train.config.checks import TrainError
@@ -130,7 +131,7 @@ def _people(config: FramesConfig, kind: str, rng: np.random.Generator) -> int:
 def made(folder: Path, shard: Shard) -> Made | None:
     """Return a shard's entry; None unless it is complete and has the same configuration."""
     try:
-        content = Made(**json.loads((folder / f"{shard.name}.json").read_text(encoding="utf-8")))
+        content = Made(**read_json(folder / f"{shard.name}.json"))
         whole = path_of(folder, shard.name).stat().st_size == content.bytes
     except (OSError, ValueError, TypeError):
         return None

@@ -7,7 +7,16 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED, check_result_target, command_line, write_result
+from edge.core.cli import (
+    EXIT_BAD_INPUT,
+    EXIT_DONE,
+    EXIT_INTERRUPTED,
+    check_result_directory,
+    check_result_target,
+    command_line,
+    write_result,
+)
+from firmware_bridge.system.terminal import CommandParser, one_line
 from tools.train.config.checks import TrainError
 from tools.train.drives.dataset import DatasetWriter
 from tools.train.drives.drive import Entry
@@ -44,7 +53,7 @@ def import_folder(root: Path, layout: str, robot: str, out: Path) -> dict[str, A
 @command_line("importers")
 def main(argv: list[str] | None = None) -> int:
     """Run the command and return its exit code."""
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="python -m tools.train.importers",
         description=__doc__,
         epilog=EXAMPLES,
@@ -58,10 +67,11 @@ def main(argv: list[str] | None = None) -> int:
     args = parser.parse_args(argv)
     try:
         check_result_target(args.json)
+        check_result_directory(args.out)
         result = import_folder(args.root, args.layout, args.robot, args.out)
         write_result(args.json, result)
     except (TrainError, OSError) as error:
-        sys.stderr.write(f"importers: {error}\n")
+        sys.stderr.write(f"importers: {one_line(error)}\n")
         return EXIT_BAD_INPUT
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED

@@ -14,7 +14,6 @@ Both: RECORDING/texts.json, optional (`read_texts`).
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import atan2
@@ -26,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.core.jpeg import MAX_BYTES, jpeg_refusal
+from firmware_bridge.system import input_file
 from tools.train.config.checks import TrainError
 from tools.train.drives.trace_sentences import aspects_of_json
 
@@ -89,10 +89,10 @@ def read_json(path: Path) -> Any:
     try:
         if path.stat().st_size > MAX_TABLE_BYTES:
             raise TrainError(f"{path}: more than {MAX_TABLE_BYTES} bytes")
-        return json.loads(path.read_text(encoding="utf-8"))
+        return input_file.read_json(path)
     except OSError as error:
         raise TrainError(f"{path}: cannot be read ({error.strerror})") from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise TrainError(f"{path}: not JSON ({error})") from error
 
 

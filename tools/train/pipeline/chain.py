@@ -6,18 +6,18 @@ The work of the steps is estimated before a run from measured throughputs.
 from __future__ import annotations
 
 import shutil
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
+from firmware_bridge.system.input_file import read_toml
 from reporting.progress import duration
 from tools.train.collect.collection import collect, run_round
 from tools.train.config.checks import TrainError
 from tools.train.config.collect import RATE_HZ
 from tools.train.config.imitate import TIC_VLA
-from tools.train.config.recipe import Recipe
+from tools.train.config.recipe import ALL, Recipe
 from tools.train.config.sft import SftConfig
 from tools.train.drives.drive import file_sha256
 from tools.train.encoder import encoder
@@ -30,7 +30,6 @@ from tools.train.run.network_file import ORDER, START, export_artifacts, stage_w
 from tools.train.run.run_dir import RunDir
 from tools.train.sft import sft
 
-ALL: Final = ("collect", "encoder", "sft", "imitate", "dagger", "rl", "evaluate")
 DISTRIBUTED: Final = ("encoder", "sft", "imitate")
 """Stages that torchrun distributes; the other stages run in its first process alone."""
 
@@ -159,11 +158,6 @@ def _round(job: StageJob, step: Step) -> dict[str, Any]:
     return run_round(job, artifacts, step.round)
 
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
 Work = list[tuple[str, int, str]]
 """(description, number of samples, key in the throughput table) of each kind of work."""
 
@@ -191,7 +185,7 @@ class Line:
 
 def throughputs(model: str, device: str) -> Mapping[str, float]:
     """Return measured samples per second by key for a network and a device; empty if none were measured."""
-    tables = tomllib.loads(FILE.read_text(encoding="utf-8"))
+    tables = read_toml(FILE)
     kind = device.partition(":")[0]
     if kind == "cpu" and not computes_bf16(kind):
         kind = "cpu-float32"

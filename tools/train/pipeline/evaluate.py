@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from edge.core.cli import write_whole
+from firmware_bridge.system.input_file import read_json
 from sim_hil.benchmark.conditions.conditions import Conditions, PolicySpec
 from sim_hil.benchmark.conditions.latency import LatencyProfile
 from sim_hil.benchmark.results.record import EpisodeResult
@@ -74,7 +75,7 @@ def write_suite(folder: Path, config: EvaluateConfig) -> Path:
     path, mark = folder / SUITE, (folder / SUITE).with_suffix(".json")
     numbers = {"episodes": config.episodes, "scenario_seed": config.scenario_seed, "kinds": dict(config.kinds)}
     if path.exists() and mark.exists():
-        if (found := json.loads(mark.read_text(encoding="utf-8"))) != numbers:
+        if (found := read_json(mark)) != numbers:
             raise TrainError(f"{path}: expected episodes of {numbers}, found {found}; delete {folder} to start again")
         return path
     scenes = folder / "scenes"

@@ -5,7 +5,6 @@ If the run started from weights with a card, that card's data and training are a
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from math import prod
 from pathlib import Path
@@ -16,6 +15,7 @@ from safetensors import safe_open
 from edge.core.cli import write_whole
 from export.model.network import PARTS
 from export.model.weights import WeightsInfo, save_weights
+from firmware_bridge.system.input_file import read_json
 from reporting.progress import duration
 from tools.train.config.checks import TrainError
 from tools.train.config.recipe import STAGES, Recipe
@@ -125,7 +125,7 @@ def _licence(begun_with_weights: bool, before: str | None) -> str:
 def score(path: Path) -> dict[str, Any]:
     """Read conditions and summary of a benchmark's result file. Raises TrainError."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
         return {key: content[key] for key in ("suite", "conditions", "summary", "latency", "trained")}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TrainError(f"--scores {path}: expected a result.json of edge-bench ({error!r})") from error
@@ -193,7 +193,7 @@ def _data(run_dir: RunDir, collected: Mapping[str, object] | None) -> str:
 
 
 def _training(run_dir: RunDir, recipe: Recipe, results: Mapping[str, Any], after: str | None) -> str:
-    versions = json.loads((run_dir.out / VERSIONS).read_text(encoding="utf-8"))
+    versions = read_json(run_dir.out / VERSIONS)
     packages = ", ".join(f"{name} {found}" for name, found in versions["packages"].items() if found)
     went_on = " --checkpoint WEIGHTS" if run_dir.begun(START) else ""
     went_on += "" if after is None else f" --after {after}"

@@ -24,6 +24,7 @@ import torch
 from edge.core.cli import write_whole
 from export.model.network import initialise
 from export.model.weights import weights_sha256
+from firmware_bridge.system.input_file import read_json
 from sim_hil.benchmark.policies.select import robot_config
 from sim_hil.benchmark.results.bootstrap import paired_ci95
 from tools.train.config.checks import TrainError
@@ -309,7 +310,7 @@ def _gained(job: StageJob, config: RlConfig) -> dict[str, Any]:
     files = [folder / f"{_evaluation_name(iteration)}.json" for iteration in (0, config.iterations)]
     if not all(file.is_file() for file in files):
         return {}
-    first, last = (json.loads(file.read_text(encoding="utf-8")) for file in files)
+    first, last = (read_json(file) for file in files)
     layouts = [str(end["id"]).rsplit("-", 3)[0] for end in first]  # without task, people and robot
     found: dict[str, Any] = {"episodes": len(first), "layouts": len(set(layouts))}
     for name in ("success", "collided", "spl"):

@@ -19,6 +19,7 @@ from export.checkpoint.load import load_checkpoint
 from export.model.config import PRESETS, ActionConfig, ModelConfigError, TicVlaConfig, config_from_dict
 from export.model.network import PARTS, TicVla, build
 from export.model.weights import WeightsInfo, save_weights
+from firmware_bridge.system.input_file import read_json
 from sim_hil.processes.child_process import last_lines
 from tools.train.config.checks import TrainError
 from tools.train.drives.drive import file_sha256
@@ -170,7 +171,7 @@ def export_artifacts(
     """Export into `out`, unless it contains these weights, and return it. Raises ExportError, KeyboardInterrupt."""
     digest, mark = file_sha256(weights), out.with_name(out.name + ".json")
     if (out / MANIFEST_NAME).is_file() and mark.is_file():
-        if json.loads(mark.read_text(encoding="utf-8")).get("weights_sha256") == digest:
+        if read_json(mark).get("weights_sha256") == digest:
             return out
         mark.unlink()
     out.parent.mkdir(parents=True, exist_ok=True)

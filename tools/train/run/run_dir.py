@@ -14,6 +14,7 @@ from typing import Any, Final
 
 from edge.core.cli import write_whole
 from export import model
+from firmware_bridge.system.input_file import read_json
 from sim_hil.benchmark.workers.code_version import code_sha256
 from tools.train.config.checks import TrainError
 from tools.train.config.recipe import STAGES, Recipe, load_recipe
@@ -59,7 +60,7 @@ class RunDir:
     def _note_versions(self) -> None:
         """Write the versions that the run started with, and under `later` those that it was continued with."""
         path, now = self.out / VERSIONS, versions()
-        first = json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+        first = read_json(path) if path.exists() else None
         later = [] if first is None else first.get("later", [])
         if first is None:
             first = now
@@ -154,7 +155,7 @@ class RunDir:
     def timings(self) -> dict[str, float]:
         """Return the seconds that each step has taken, including resumed parts."""
         path = self.out / TIMINGS
-        return dict(json.loads(path.read_text(encoding="utf-8"))) if path.exists() else {}
+        return dict(read_json(path)) if path.exists() else {}
 
     def add_time(self, step: str, seconds: float) -> None:
         """Add to the time of a step."""
@@ -165,7 +166,7 @@ class RunDir:
     def result(self, stage: str) -> dict[str, Any] | None:
         """Return the result of a finished stage; None if it has not finished."""
         path = self.out / stage / "result.json"
-        return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+        return read_json(path) if path.exists() else None
 
     def finish(self, stage: str, result: Mapping[str, object]) -> None:
         """Write the result of a stage, which marks it as finished."""

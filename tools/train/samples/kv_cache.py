@@ -24,6 +24,7 @@ from tokenizers import Tokenizer
 from edge.core.cli import write_whole
 from edge.state.reasoning_text import Waypoints, parse_waypoints
 from export.model.network import TicVla
+from firmware_bridge.system.input_file import read_json
 from tools.train.config.checks import TrainError
 from tools.train.config.imitate import KvConfig
 from tools.train.config.sft import DrawConfig
@@ -78,7 +79,7 @@ class KvCache:
         """Open a folder that `build_kv_cache` wrote. Raises TrainError."""
         self.folder = folder
         try:
-            content = json.loads((folder / INDEX).read_text(encoding="utf-8"))
+            content = read_json(folder / INDEX)
             if content["format"] != FORMAT:
                 raise TrainError(f"{folder}: expected a cache of format {FORMAT}; delete it and build it again")
             self.key: str = content["key"]
@@ -145,7 +146,7 @@ def _npy(folder: Path, drive_id: str) -> Path:
 def _read(folder: Path, drive_id: str) -> Mapping[str, Any]:
     path = folder / f"{drive_id}.json"
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
         return {"drive_sha256": content["drive_sha256"], "states": content["states"]}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TrainError(f"{path}: no states of this drive ({error!r}); build the cache for it") from error

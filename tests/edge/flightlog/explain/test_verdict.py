@@ -91,6 +91,13 @@ def test_a_contact_with_a_person_asks_whether_the_picture_showed_one(
     assert only(flight, COLLISION).cause == cause
 
 
+def test_a_contact_with_a_person_whom_the_text_named_is_the_action_experts_whatever_the_route() -> None:
+    person, named = (SPEED_MPS * 9.0 + 2.0, 0.3), TEXT.replace("nobody near", "person ahead 2 m standing")
+    truths = touched("person", people=(person,), route_bearing_rad=1.5)
+    flight = flights.flight(truths=truths, texts=lambda _: named)  # type: ignore[arg-type]
+    assert only(flight, COLLISION).cause == EXPERT
+
+
 def test_a_person_who_walks_into_a_standing_robot_is_the_cause() -> None:
     def still(second: float) -> RecordedTick:
         return flights.tick(second, command=(0.0, 0.0, 0.0))

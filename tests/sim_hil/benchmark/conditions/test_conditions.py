@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from edge.state.switches import Decoding, RecoverySwitch
-from sim_hil.benchmark.cli import conditions_of, parser
+from edge.state.switches import Decoding, RecoverySwitch, Speculation, Switches
+from sim_hil.benchmark.arguments import conditions_of, parser
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError, PolicySpec
 from sim_hil.benchmark.conditions.latency import LatencyProfile
 
@@ -40,14 +40,14 @@ def test_the_robot_halts_at_its_own_stop_only_on_request() -> None:
 
 def test_a_switch_without_an_option_is_the_manifests() -> None:
     free = asked("--policy", "artifacts:nano", "--decoding", "free")
-    resolved = free.with_defaults_of(Decoding.CONSTRAINED, RecoverySwitch.OFF)
-    assert (resolved.decoding, resolved.recovery) == ("free", "off")
+    resolved = free.with_defaults_of(Switches(Decoding.CONSTRAINED, RecoverySwitch.OFF, False, Speculation.OFF))
+    assert (resolved.decoding, resolved.recovery, resolved.speculation) == ("free", "off", "off")
     assert "decoding free, recovery off" in resolved.describe()
 
 
 def test_conditions_of_an_older_version_can_still_be_read() -> None:
     content = asked("--policy", "artifacts:nano").as_json()
-    added = ("decoding", "recovery", "wordings", "swap_instructions")
+    added = ("decoding", "recovery", "speculation", "wordings", "swap_instructions")
     old = {key: value for key, value in content.items() if key not in added}
     assert Conditions.of_json(old) == asked("--policy", "artifacts:nano")
 

@@ -1,0 +1,38 @@
+"""Messages for a terminal: text from a file or a command line must not move its cursor, nor fill its screen."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import Any, Final, NoReturn
+
+LONGEST_LINE: Final = 1500
+"""Longest message, characters; its middle is left out."""
+
+
+def one_line(text: object) -> str:
+    """Return a message as one printable line of at most LONGEST_LINE characters."""
+    line = "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in str(text))
+    if len(line) > LONGEST_LINE:
+        half = LONGEST_LINE // 2 - 10
+        line = f"{line[:half]} [...] {line[-half:]}"
+    return line
+
+
+class CommandParser(argparse.ArgumentParser):
+    """Argument parser whose errors are one printable line, after the usage."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Refuse `--option=--`, which argparse of Python 3.11 takes for an empty list."""
+        arguments = sys.argv[1:] if args is None else list(args)
+        for each in arguments:
+            if each == "--":
+                break
+            if each.startswith("--") and each.endswith("=--"):
+                self.error(f"argument {each.removesuffix('=--')}: expected a value, found '--'")
+        return super().parse_known_args(arguments, namespace)
+
+    def error(self, message: str) -> NoReturn:
+        """Print usage and message and end with exit code 2."""
+        self.print_usage(sys.stderr)
+        self.exit(2, f"{self.prog}: error: {one_line(message)}\n")

@@ -1,0 +1,65 @@
+"""Pinned packages in the wheel: which of them a board installs."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from edge.deploy.pins import FILE, PinsError, parse_pins, pinned_steps, pins_of, read_pins
+
+HASHED = Path(__file__).resolve().parents[3] / "constraints-hashed.txt"
+SHIPPED = HASHED.read_text(encoding="utf-8")
+
+
+def test_the_base_install_is_pinned_and_an_extra_only_where_it_is_chosen() -> None:
+    pins = parse_pins(SHIPPED)
+    base, can = (pins.for_board("aarch64", (3, 11), extras) for extras in ((), ("can",)))
+    assert base is not None and "numpy==" in base and "python-can==" not in base
+    assert can is not None and "python-can==" in can
+
+
+def test_every_pin_has_a_hash() -> None:
+    text = parse_pins(SHIPPED).for_board("x86_64", (3, 11), ("cpu", "unitree", "mavlink", "can", "sign")) or ""
+    assert text.count("==") >= 40
+    assert all("--hash=sha256:" in entry for entry in text.replace("\\\n", "").splitlines())
+
+
+def test_an_unknown_platform_has_no_pins() -> None:
+    assert parse_pins(SHIPPED).for_board("riscv64", (3, 11), ()) is None
+
+
+def test_a_wheel_without_pins_says_so(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "x.whl", "w") as archive:
+        archive.writestr("edge/__init__.py", "")
+    assert read_pins(tmp_path / "x.whl") is None
+    assert pins_of(tmp_path / "x.whl", (), "x86_64") == (None, "the wheel has no pinned packages")
+
+
+@pytest.mark.parametrize(
+    "text", ["", "a==1\n", "# platforms: x\n# extras: base\na==1\n", "# platforms: x\n# extras: base\n"]
+)
+def test_a_file_without_hashes_is_refused(text: str, tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "x.whl", "w") as archive:
+        archive.writestr(FILE, text)
+    with pytest.raises(PinsError):
+        read_pins(tmp_path / "x.whl")
+
+
+def test_pip_installs_pins_by_hash_and_resolves_nothing_itself(tmp_path: Path) -> None:
+    ran: list[list[str]] = []
+
+    def command(words: list[str]) -> tuple[int, str]:
+        ran.append(words)
+        return 0, ""
+
+    pip = ["python", "-m", "pip", "install"]
+    for step in pinned_steps(tmp_path / "pins.txt", "a==1\n", pip, Path("x.whl"), ("b",), command)[1:]:  # type: ignore[arg-type]
+        step.act(None)  # type: ignore[arg-type]
+    assert ran == [
+        [*pip, "--no-deps", "--require-hashes", "-r", str(tmp_path / "pins.txt")],
+        [*pip, "--no-deps", "x.whl"],
+        [*pip, "b"],
+        ["python", "-m", "pip", "check"],
+    ]
