@@ -18,7 +18,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 FEW = ("missing", "deep-list", "fifo", "loop", "not-utf8", "escape-name", "text ''")
 """Bad values of the quick test."""
 WITHOUT_ARGUMENTS = ("tools.fault_table",)
-ON_DEMAND = "tools.bench."
+ON_DEMAND = ("tools.bench.", "tools.can_trace.", "tools.fuzz", "tools.interop.")
 """Measurements by hand, whose arguments only their author gives."""
 
 
@@ -30,6 +30,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
+def placed(command: Command, artifacts: Path) -> Command:
+    """Put the artifact directory into the command lines of a row."""
+    good, quick = (text.replace("{artifacts}", str(artifacts)) for text in (command.good, command.quick))
+    return replace(command, good=good, quick=quick)
+
+
 def describe(answers: list[Answer]) -> str:
     return "\n".join(f"{a.case.what}: {'; '.join(a.faults)}: {a.err[-300:]!r}" for a in answers if a.faults)
 
@@ -38,9 +44,7 @@ def describe(answers: list[Answer]) -> str:
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("command", [*TABLE, *TOOLS], ids=lambda command: command.name)
 def test_every_bad_input_is_refused_in_one_clear_line(command: Command, folder: Path, artifacts_dir: Path) -> None:
-    given = {"good": command.good, "quick": command.quick}
-    placed = {name: text.replace("{artifacts}", str(artifacts_dir)) for name, text in given.items()}
-    command = replace(command, **placed)
+    command = placed(command, artifacts_dir)
     answers = run(command, folder, list(cases(command, folder)))
     assert not any(answer.faults for answer in answers), describe(answers)
 
@@ -58,7 +62,7 @@ def test_every_console_script_has_at_least_thirty_bad_inputs(folder: Path) -> No
     counts: dict[str, int] = {}
     for command in TABLE:
         name = command.name.split()[0]
-        counts[name] = counts.get(name, 0) + len(list(cases(command, folder)))
+        counts[name] = counts.get(name, 0) + len(list(cases(placed(command, folder), folder)))
     assert set(counts) == {*COMMANDS, "edge-bridge"} and min(counts.values()) >= 30, counts
 
 

@@ -105,6 +105,7 @@ def test_on_a_disk_too_full_to_record_to_nothing_is_started(
 ) -> None:
     monkeypatch.setattr("edge.flightlog.recorder._free", lambda _: (69 << 30, 1000 << 30))
     monkeypatch.setattr(command, "Rig", lambda *_: pytest.fail("a rig was made"))
+    monkeypatch.setattr(command, "read_manifest", lambda _: None)
     assert command.main(["--artifacts", str(tmp_path), "--out", str(tmp_path / "out"), "--domain", "1"]) == 1
     assert "recording needs 71680 MiB" in capsys.readouterr().err
 
