@@ -85,7 +85,7 @@ class Metrics:
     def text(self, dropped: int) -> bytes:
         """Return the metrics as text; `dropped`: records that the view could not take."""
         self._dropped.set(dropped)
-        return bytes(generate_latest(self._registry))
+        return bytes(generate_latest(self._registry))  # type: ignore[no-untyped-call]
 
 
 def _set(gauge: Gauge, value: float | None) -> None:
