@@ -16,6 +16,7 @@ from edge.reasoning.generation_cycle import Mode
 from edge.run import assembly, robot_inputs
 from edge.run.robot_inputs import RobotInputs
 from edge.safety.monitors.watch import WatchConfig
+from edge.state.switches import Decoding, RecoverySwitch, Switches
 from firmware_bridge.core.config import RobotConfig, load_robot_config
 
 ROBOTS = Path(firmware_bridge.__file__).parent / "robots"
@@ -39,7 +40,7 @@ def test_its_limits_reach_the_controller_and_the_monitor_of_the_policys_output(
     monkeypatch.setattr(assembly, "ReasoningLoop", lambda *_args, **_named: SimpleNamespace(cycle=None))
     runtime = SimpleNamespace(
         tick_period_ms=100, image_px=32, step_s=0.1, frame_offsets_s=(1.0, 0.0), max_new_tokens=8,
-        decoding="constrained", recovery="on",
+        switches=Switches(Decoding.CONSTRAINED, RecoverySwitch.ON, False),
     )  # fmt: skip
     artifacts = SimpleNamespace(runtime=runtime, trained=True, guided_by_waypoints=False, directory=Path("a"))
     policy = SimpleNamespace(tokens_shape=(1, 4, 8), artifacts=artifacts)
