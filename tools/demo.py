@@ -323,7 +323,7 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Sequence[str]
         domain = free_domain() if args.domain is None else args.domain
         artifacts = args.artifacts or args.out / "artifacts"
         check_result_target(args.json)
-        if artifacts.exists():
+        if args.artifacts is not None and artifacts.exists():  # the demo's own are exported again if they do not fit
             read_manifest(artifacts)
         options = DemoOptions(
             args.out, artifacts, args.duration, args.seed, args.people, domain, ROBOTS[args.robot], args.live

@@ -12,15 +12,17 @@ import socket
 import stat
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 from edge.live.feed import LiveError, LiveFeed, LiveOptions
 from edge.reasoning.prompt import InstructionError, check_instruction
 from edge.run.arming import RefusedError
-from edge.run.assembly import RunOptions
 from edge.run.stop_phrase import is_stop_phrase
 from firmware_bridge.core.config import RobotConfig
 from firmware_bridge.dds.shared_bus import SharedBus
+
+if TYPE_CHECKING:
+    from edge.run.assembly import RunOptions  # loads the engines, which the installer must not need
 
 MAX_BYTES: Final = 4096
 """Largest datagram, bytes: 400 characters of an instruction, each in its longest JSON escape."""

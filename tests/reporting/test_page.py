@@ -15,7 +15,7 @@ def demo_page(**changed: object) -> str:
         "title": "a page", "passed": True, "verdict": "", "instruction": "", "robot": "", "scene": "", "people": 0,
         "seed": 0, "duration_s": 1.0, "untrained": False, "tiles": [], "maps": [], "cards": [], "histograms": [],
         "time_line": {"png": b"", "alt": "", "caption": "", "wide": False}, "checks": table, "numbers": table,
-        "machine": None,
+        "machine": None, "events": None,
     }  # fmt: skip
     return render("demo", **{**values, **changed})
 

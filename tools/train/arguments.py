@@ -111,12 +111,11 @@ def check(args: argparse.Namespace) -> Recipe:
         raise TrainError("--out is missing: expected the folder of the run, e.g. --out out/run")
     check_result_directory(args.out)
     check_result_directory(args.ship, "--ship")
-    for score in args.scores:
-        if not score.is_file():
-            raise TrainError(f"--scores {score}: expected edge-bench's result.json, found no file")
     if args.command == "card":
+        for score in args.scores:
+            if not score.is_file():
+                raise TrainError(f"--scores {score}: expected edge-bench's result.json, found no file")
         return recipe
-    _check_inputs(args)
     if args.scores or args.ship:
         raise TrainError("--scores and --ship belong to card")
     if args.base is not None and args.checkpoint:
@@ -127,6 +126,7 @@ def check(args: argparse.Namespace) -> Recipe:
         raise TrainError("--after and --drives: expected one of them, --after continues without earlier drives")
     if args.after is not None and not args.checkpoint:
         raise TrainError("--after: expected --checkpoint with it, the weights that the step wrote")
+    _check_inputs(args)
     return recipe
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from sim_hil.hil import command as hil
 from sim_hil.hil import display
+from sim_hil.hil.arguments import EPILOG
 from sim_hil.hil.display import DisplayError, check_display
 from sim_hil.protocols.can.front_end import LinkOptions as CanLink
 from sim_hil.protocols.mavlink.front_end import LinkOptions as MavlinkLink
@@ -87,7 +88,7 @@ def test_a_rate_of_poses_that_physics_does_not_have_is_refused(capsys: pytest.Ca
 
 
 def test_every_address_in_the_help_is_valid_for_its_protocol() -> None:
-    examples = re.findall(r"--protocol (can|mavlink) --link (\S+)", hil.EPILOG)
+    examples = re.findall(r"--protocol (can|mavlink) --link (\S+)", EPILOG)
     assert {protocol for protocol, _ in examples} == {"can", "mavlink"}
     for protocol, link in examples:
         {"can": CanLink, "mavlink": MavlinkLink}[protocol].parse(link)

@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import signal
+import socket
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -96,6 +97,7 @@ class NoProcessors:
     """A cluster, as Ray tells of it, whose processors come and go as a test says."""
 
     def __init__(self) -> None:
+        self.address = ""
         self.processors = 0
         self.now_ns = 0
         self.slept_s: list[float] = []
@@ -118,21 +120,25 @@ class NoProcessors:
 
 
 @pytest.fixture
-def bare(monkeypatch: pytest.MonkeyPatch) -> NoProcessors:
+def bare(monkeypatch: pytest.MonkeyPatch) -> Iterator[NoProcessors]:
     cluster = NoProcessors()
     monkeypatch.setitem(sys.modules, "ray", cluster)
-    return cluster
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        cluster.address = f"127.0.0.1:{listening.getsockname()[1]}"
+        yield cluster
 
 
 def jobs_on(cluster: NoProcessors) -> ClusterJobs:
-    return ClusterJobs("here:1", now_ns=lambda: cluster.now_ns, sleep=cluster.sleep)
+    return ClusterJobs(cluster.address, now_ns=lambda: cluster.now_ns, sleep=cluster.sleep)
 
 
 def test_a_cluster_without_processors_is_given_up_in_one_line_and_not_spun_on(
     bare: NoProcessors, tmp_path: Path
 ) -> None:
     store = ResultStore.create(tmp_path / "out", {"episodes": []})
-    with pytest.raises(ClusterError, match=r"--cluster here:1: expected a processor .* none for 60 s; add a node"):
+    with pytest.raises(
+        ClusterError, match=r"--cluster 127\.0\.0\.1:\d+: expected a processor .* none for 60 s; add a node"
+    ):
         run_all([fakes.task("a", store.directory)], jobs_on(bare), store)
     assert set(bare.slept_s) == {POLL_S} and sum(bare.slept_s) == pytest.approx(60, abs=1)
 

@@ -103,7 +103,7 @@ def test_a_plan_with_their_drives_collects_nothing(theirs: Dataset, capsys: pyte
         (("sft", "--from", "b"), "both name the drives"),
         (("all", "--checkpoint", "w", "--after", "imitate"), "continues without earlier drives"),
         (("card",), "belongs to stages"),
-        (("sft",), "not the index of a data set"),
+        (("sft",), "expected a data set with dataset.json"),
     ],
 )
 def test_invalid_arguments_are_refused_in_one_line(

@@ -54,7 +54,7 @@ def alone(language: LanguageModel, one: Row, upto: int) -> tuple[torch.Tensor, t
     pictures = torch.from_numpy(np.stack(one.frames)).float()
     with torch.no_grad():
         _, logits, kv, *_ = language(torch.tensor([one.fed[:upto]]), pictures, past)
-    return logits[0], kv[0]
+    return logits[-1], kv[0]
 
 
 def test_keys_values_and_scores_of_every_row_are_those_of_the_row_alone(language: LanguageModel) -> None:
