@@ -17,6 +17,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from edge.artifacts.manifest import MOST_ROWS
 from edge.reasoning.prompt import Segment
 from export.evaluation.parity import sample_inputs
 from export.evaluation.task_error import (
@@ -285,7 +286,7 @@ class LanguageProbe(Probe):
         assert isinstance(weight, nn.Parameter)
         with torch.no_grad(), self._rounded(language, precision):
             hidden, _, kv = language.hidden_states(ids, torch.zeros(1, vision.tokens, vision.token_dim), caches)
-            logits = self._rounder.logits(weight, hidden[0, -1:], precision.of("lm_head"))
+            logits = self._rounder.logits(weight, hidden[0, -MOST_ROWS:], precision.of("lm_head"))
         return logits.numpy(), kv.numpy()
 
     def _calls_error(self, precision: Precision) -> float:
