@@ -25,6 +25,7 @@ from sim_hil.realtime.truth import read_lines
 from sim_hil.scene.scene import Vec3
 from sim_hil.soak import cli, leg
 from sim_hil.soak.analysis import ANALYSIS, TRACE, faults_of, read_life, read_trace
+from sim_hil.soak.arguments import parse_seconds
 from sim_hil.soak.leg import EVENTS, SAMPLES, Leg
 from sim_hil.soak.run import SoakFolder
 from sim_hil.soak.tasks import Journey, SoakTask
@@ -236,7 +237,7 @@ def test_the_files_of_a_killed_soak_are_counted(soaked: Soaked, tmp_path: Path) 
 
 @pytest.mark.parametrize(("text", "seconds"), [("90s", 90), ("10m", 600), ("1.5h", 5400), ("1d", 86_400), ("45", 45)])
 def test_a_time_has_a_unit_or_is_in_seconds(text: str, seconds: float) -> None:
-    assert cli.parse_seconds(text) == seconds
+    assert parse_seconds(text) == seconds
 
 
 @pytest.mark.parametrize(
