@@ -17,6 +17,7 @@ import math
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from statistics import median
 from typing import Any, Final, TypeAlias
 
@@ -40,7 +41,6 @@ from edge.state.ring import EncodedFrame
 
 Line: TypeAlias = tuple[int, ...]
 Encode: TypeAlias = Callable[[str], Sequence[int]]
-
 
 FREE: Final = "free"
 """Any progress: there is no earlier one, or the rules are off."""
@@ -197,11 +197,9 @@ class LineConstraint:
 
     def forced(self) -> Line:
         """Return the next tokens that `choose` will return whatever the model chooses."""
-        if self._at == 0 or not self._lines:
-            return ()
-        first, *others = (line[self._at :] for line in self._lines)
-        same = (i for i in range(len(first)) if any(line[i : i + 1] != first[i : i + 1] for line in others))
-        return first[: next(same, len(first))]
+        rest = [line[self._at :] for line in self._lines] if self._at else []
+        same = takewhile(lambda column: len(set(column)) == 1, zip(*rest, strict=False))
+        return tuple(column[0] for column in same)
 
 
 class TextConstraint:
@@ -385,10 +383,7 @@ class _Rotation:
                 self._made_ns.setdefault(side, stamp_ns)
 
     def made(self, named: str | None) -> tuple[str | None, int | None]:
-        """Return (side, since when in ns) of the made turn: the named side, unless only the other was seen.
-
-        An instant of None: the turn may still be going on.
-        """
+        """Return (side, ns; None: it may go on) of the made turn: the named one, unless only the other was seen."""
         only_other = len(self._made_ns) == 1 and named not in self._made_ns
         side = next(iter(self._made_ns)) if only_other else named
         return side, None if side is None else self._made_ns.get(side)

@@ -118,8 +118,7 @@ def build_stages(job: Job, known_s: Mapping[str, float], *, graphs: bool = True)
         if vision.form == "plain" and "int8" in (vision.precision, *vision.candidates):
             names += ["activation ranges"]
         names += [f"graph {graph}" for graph in order]
-    names += [f"gate {graph}" for graph in order]
-    names += ["self-test", "plan and report"] if graphs else ["self-test"]
+    names += [*(f"gate {graph}" for graph in order), "self-test", *(["plan and report"] if graphs else [])]
     usual = {name: next(EXPECTED_S[kind][column] for kind in EXPECTED_S if name.startswith(kind)) for name in names}
     return [Stage(name, known_s.get(name, usual[name])) for name in names]
 
@@ -165,8 +164,7 @@ class Pipeline:
         def build(directory: Path) -> None:
             (directory / RESULT_NAME).write_text(json.dumps(compute(), allow_nan=False), encoding="utf-8")
 
-        content: dict[str, Any] = read_json(self._stage(title, key, build) / RESULT_NAME)
-        return content
+        return dict(read_json(self._stage(title, key, build) / RESULT_NAME))
 
     def _key(
         self, stage: str, parts: Mapping[str, object], modules: tuple[str, ...], recipe: Callable[..., Any]
