@@ -24,6 +24,7 @@ from typing import Final
 from edge.flightlog.part import Payload, encode
 from edge.live.wire import (
     CONFIG,
+    EVENTS,
     LISTENING,
     MOST_BYTES,
     PICTURE,
@@ -40,8 +41,6 @@ from edge.live.wire import (
 LOOPBACK: Final = "127.0.0.1"
 DEFAULT_PORT: Final = 8765
 """The port at which viewers of robot data look first."""
-EVENTS: Final = frozenset({"/run", "/semantic", "/fault", "/result"})
-"""Topics of which every record counts; of all others, only the newest."""
 _MOST_EVENTS: Final = 256
 _PERIOD_S: Final = 0.05
 _START_S: Final = 10.0

@@ -31,13 +31,13 @@ from edge.flightlog.standard_schemas import COMPRESSED_IMAGE, STANDARD_SCHEMAS, 
 from edge.live import wire
 from edge.live.foxglove import MOST_REQUEST_BYTES, SUBPROTOCOLS, Channels, ProtocolError, Subscriptions, server_info
 from edge.live.metrics import CONTENT_TYPE, Metrics
-from edge.live.view import HISTORY, LiveState, Message
+from edge.live.view import LiveState, Message
 from firmware_bridge.operate import operate
 
 FOXGLOVE_ORIGINS: Final = ("https://app.foxglove.dev",)
 MOST_CLIENTS: Final = 16
 STOP_ANSWER_S: Final = 3.0
-EACH_COUNTS: Final = frozenset({*HISTORY, "/log", "/scene"})
+EACH_COUNTS: Final = frozenset({*wire.EVENTS, "/log", "/scene"})
 """Topics of which a client gets every message, up to _MOST_WAITING; of all others only the newest."""
 
 _MOST_WAITING: Final = 64
@@ -166,7 +166,7 @@ class LiveServer:
         kind, _, given = request.headers.get("Authorization", "").partition(" ")
         if kind != "Bearer":
             given = request.query.get("token", "")
-        if not hmac.compare_digest(given.encode(), self._config.token.encode()):
+        if not hmac.compare_digest(given.encode(errors="replace"), self._config.token.encode()):
             raise web.HTTPForbidden(text="the token is missing or wrong: use the address that edge-run printed\n")
         origin = request.headers.get("Origin")
         own = f"{request.scheme}://{request.host}"

@@ -13,11 +13,10 @@ import numpy as np
 
 from edge.core.geometry import SE2
 from edge.flightlog.standard_messages import Mount, jpeg_size
+from edge.live.wire import EVENTS
 from edge.odometry.camera_geometry import Attitude, FloorProjector
 from edge.safety.faults.table import FAULTS
 
-HISTORY: Final = ("/run", "/semantic", "/fault", "/result")
-"""Topics whose last records a new client gets all; of the others it gets the newest."""
 OVERLAY: Final = "/overlay"
 _KEPT: Final = 24
 _NEAREST_M: Final = 0.35
@@ -38,7 +37,8 @@ class LiveState:
 
     def __init__(self) -> None:
         self._newest: dict[str, Message] = {}
-        self._history: dict[str, deque[Message]] = {topic: deque(maxlen=_KEPT) for topic in HISTORY}
+        # A new client gets the last events, and the newest record of every other topic.
+        self._history: dict[str, deque[Message]] = {topic: deque(maxlen=_KEPT) for topic in EVENTS}
         self._mount: Mount | None = None
         self._size: tuple[int, int] | None = None
         self._attitude = Attitude()
@@ -78,7 +78,7 @@ class LiveState:
 
     def snapshot(self) -> Iterator[Message]:
         """Return what a new client needs: the last events, then the newest of every other topic."""
-        for topic in HISTORY:
+        for topic in EVENTS:
             yield from self._history[topic]
         yield from self._newest.values()
 

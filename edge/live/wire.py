@@ -14,6 +14,8 @@ from typing import Any, Final
 RECORD, PICTURE, CONFIG, STOPPED, LISTENING, STOP, REFUSED = 1, 2, 3, 4, 5, 6, 7
 """Kinds. From the runner: a record as JSON, a JPEG, the configuration, the answer to a stop. From the view: the port
 at which it listens, a request to stop, why it cannot listen."""
+EVENTS: Final = ("/run", "/semantic", "/fault", "/result")
+"""Topics of which every record counts; of all others, only the newest."""
 MOST_BYTES: Final = 1 << 20
 """Largest datagram, bytes: far above a JPEG of a front camera."""
 

@@ -291,9 +291,9 @@ class BaseReader:
         return 0
 
     def _emergency_stop(self) -> bool:
-        """Return whether the base's button is held down, or its emergency stop has come on since the last step.
+        """Return whether the base's button is pressed, or its emergency stop has latched since the last step.
 
-        The level of a latched stop is no press: it ends only by the reset that a permitted arming sends.
+        A stop that stays latched does not count again. Only the reset of a permitted arming ends it.
         """
         state, pressed = self._config.state, self._stop_pressed
         self._stop_pressed = False
