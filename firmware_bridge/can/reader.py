@@ -38,10 +38,17 @@ class _Stream:
         self.bad_in_a_row = 0
         self.verdict = Verdict.FIRST
         self.good_ns = now_ns
+        self.counted_ns = now_ns
+        """Time at which the checker last took a counter, ns: of a good frame, or of the first one after a pause."""
         self._missing_ns = max(missing_cycles * message.cycle_ns, _LEAST_MISSING_NS) if message.cycle_ns else 0
 
     def is_missing(self, now_ns: int) -> bool:
         return self._missing_ns > 0 and now_ns - self.good_ns > self._missing_ns
+
+    def forget_old_counter(self, now_ns: int) -> None:
+        """Forget a counter that is too old to compare with; a frame that came since then keeps its own."""
+        if now_ns - self.counted_ns > self._missing_ns:
+            self.checker.forget()
 
     def counter(self) -> int | None:
         protection = self.message.protection
@@ -154,7 +161,7 @@ class BaseReader:
         silent = any(stream.is_missing(now_ns) for stream in self._vital)
         for stream in self._streams.values():
             if stream.is_missing(now_ns):
-                stream.checker.forget()
+                stream.forget_old_counter(now_ns)
                 if silent and stream not in self._vital:
                     stream.good_ns = now_ns  # its cycle time counts again from the base's return
         state, self._state = self._state, None
@@ -174,6 +181,8 @@ class BaseReader:
         verdict = stream.checker.check(frame)
         self.counts.wrong += verdict in (Verdict.WRONG_CRC, Verdict.WRONG_LENGTH)
         self.counts.wrong_counter += verdict in (Verdict.REPEATED, Verdict.OUT_OF_ORDER)
+        if verdict in (Verdict.FIRST, Verdict.GOOD):
+            stream.counted_ns = now_ns
         if verdict is Verdict.FIRST:
             return
         if verdict is not Verdict.GOOD:

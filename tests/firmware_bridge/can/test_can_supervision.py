@@ -57,6 +57,18 @@ def test_five_wrong_crcs_in_a_row_stop_the_robot_within_100_ms(opened: Opener) -
     assert "5 invalid frames of OdometryMotion in a row (wrong crc)" in bench.core.status(rig.now_ns()).reason
 
 
+@pytest.mark.parametrize("path", [CARTER, EXAMPLE])
+def test_a_bus_that_corrupted_every_frame_for_a_second_can_be_used_again(opened: Opener, path: Path) -> None:
+    rig, bench = opened(path)
+    bench.drive()
+    rig.on_bus = lambda identifier, data: [(identifier, bytes(byte ^ 0xFF for byte in data))]
+    stopped_by(bench, "unsafe_robot", 1.0)
+    bench.run(1.0)
+    rig.on_bus = lambda identifier, data: [(identifier, data)]
+    bench.asking = True
+    bench.until(lambda status: status.state == "armed", 3.0, "armed after recovery")
+
+
 def test_every_third_frame_with_a_wrong_crc_does_not_stop_it(opened: Opener) -> None:
     rig, bench = opened()
     bench.drive()
