@@ -12,8 +12,6 @@ from edge.commands import COMMANDS
 from tests.support.bad_input.commands import TABLE, TOOLS
 from tests.support.bad_input.harness import Answer, Command, cases, prepare, run
 
-pytestmark = pytest.mark.process
-
 REPOSITORY = Path(__file__).resolve().parents[2]
 FEW = ("missing", "deep-list", "fifo", "loop", "not-utf8", "escape-name", "text ''")
 """Bad values of the quick test."""
