@@ -153,6 +153,15 @@ class TestTakeover:
         bench.run(5.0)
         assert bench.mode is Mode.MANUAL and bench.status is not None and bench.status.state != "armed"
 
+    def test_after_a_failsafe_of_the_rover_no_operator_is_needed(self) -> None:
+        bench = driving("px4")
+        bench.to_rover = lost
+        bench.until(lambda: bench.mode is Mode.HOLD, 5.0, "the rover's failsafe")
+        bench.to_rover = whole
+        bench.asking = True
+        bench.until(lambda: bench.mode is Mode.OFFBOARD, 10.0, "an arming")
+        bench.drive()
+
     @pytest.mark.parametrize("mode", [Mode.MANUAL, Mode.HOLD])
     def test_a_mode_of_a_ground_station_ends_the_drive_and_stays(self, mode: Mode) -> None:
         bench = driving()
