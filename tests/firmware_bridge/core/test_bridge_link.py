@@ -90,6 +90,38 @@ def test_a_status_with_an_unknown_state_flag_cause_permit_or_motion_is_refused(o
         decode(bytes(good))
 
 
+@pytest.mark.parametrize(("offset", "count"), [(8, len(STATES)), (9, 2), (10, len(CAUSES)), (12, len(PERMITS))])
+def test_the_first_value_behind_a_table_is_refused_and_the_last_one_in_it_is_not(offset: int, count: int) -> None:
+    good = bytearray(encode(BridgeStatus(1, "armed", "", 0, 0, 0, (0.0, 0.0, 0.0), False)))
+    for behind in (offset, offset + 1) if offset in (10, 12) else (offset,):  # the causes and the robot are pairs
+        data = good.copy()
+        data[8 + behind] = count - 1
+        assert isinstance(decode(bytes(data)), BridgeStatus)
+        data[8 + behind] = count
+        with pytest.raises(LinkError):
+            decode(bytes(data))
+
+
+@given(st.integers(0, 9), st.sampled_from([0, 16, 40, 64, 86, 100, 152, 160, 300]), st.integers(-9, 9))
+def test_any_kind_with_a_body_of_any_length_is_a_message_or_a_link_error(kind: int, length: int, more: int) -> None:
+    body = bytes(max(length + more, 0))
+    with contextlib.suppress(LinkError):
+        assert encode(decode(struct.pack("<4sBBH", b"TVEB", VERSION, kind, len(body)) + body))[5] == kind
+
+
+def test_a_status_without_a_report_of_the_robot_says_so() -> None:
+    status = BridgeStatus(1, "armed", "", 0, 0, 0, (0.0, 0.0, 0.0), False)
+    assert (status.motion, status.speed_mps, status.blocked_by, status.cause) == ("unknown", -1.0, "none", "none")
+
+
+@pytest.mark.parametrize("reason", [b"\xff", b"caf\xc3", b"\xed\xa0\x80"])
+def test_a_reason_that_is_not_utf_8_is_refused(reason: bytes) -> None:
+    good = encode(BridgeStatus(1, "armed", "", 0, 0, 0, (0.0, 0.0, 0.0), False))
+    framed = struct.pack("<4sBBH", b"TVEB", VERSION, 4, len(good) - 8 + len(reason)) + good[8:] + reason
+    with pytest.raises(LinkError, match="reason is not UTF-8"):
+        decode(framed)
+
+
 def test_numbers_that_are_not_finite_pass_the_codec_because_the_gate_judges_them() -> None:
     decoded = decode(encode(Velocity(1, 2, float("nan"), float("inf"), 0.0)))
     assert isinstance(decoded, Velocity) and decoded.vx_mps != decoded.vx_mps
