@@ -10,18 +10,17 @@ import contextlib
 import errno
 import json
 import os
-import secrets
 import socket
 import subprocess
 import sys
 import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from edge.flightlog.part import Payload, encode
+from edge.live.options import LiveError, LiveOptions
 from edge.live.wire import (
     CONFIG,
     EVENTS,
@@ -38,44 +37,23 @@ from edge.live.wire import (
     decode,
 )
 
-LOOPBACK: Final = "127.0.0.1"
-DEFAULT_PORT: Final = 8765
-"""The port at which viewers of robot data look first."""
 _MOST_EVENTS: Final = 256
 _PERIOD_S: Final = 0.05
 _START_S: Final = 10.0
 _NICENESS: Final = 10
-_TOKEN_BYTES: Final = 16
-
-
-class LiveError(OSError):
-    """The live view cannot start; one line."""
-
-
-@dataclass(frozen=True)
-class LiveOptions:
-    """Where to listen; port 0 takes a free one. Raises ValueError."""
-
-    address: str = LOOPBACK
-    port: int = DEFAULT_PORT
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.port <= 65_535:
-            raise ValueError(f"--live {self.port}: expected a port from 0 to 65535")
-        if not self.address:
-            raise ValueError("--live-address: expected an address, found none")
 
 
 class LiveFeed:
     """Feed of one live view; `put` may be called by any thread, `poll` by one. An `InstructionChannel`."""
 
     def __init__(
-        self, options: LiveOptions, bridge: Path, stop: Callable[[], bool], report: Callable[[str], None]
+        self, options: LiveOptions, bridge: Path | None, stop: Callable[[], bool], report: Callable[[str], None]
     ) -> None:
         """Start the view's process and wait until it listens.
 
-        `bridge`: socket of the run's bridge. `stop` stops the robot and returns whether its bridge has confirmed it.
-        `report` takes a line for the operator. Raises LiveError.
+        `bridge`: socket of the run's bridge; None: a view that cannot stop anything and has no STOP button. `stop`
+        stops the robot and returns whether its bridge has confirmed it. `report` takes a line for the operator. Raises
+        LiveError.
         """
         self.stopped = False
         """Whether the view has requested a stop."""
@@ -85,7 +63,7 @@ class LiveFeed:
         self._events: deque[tuple[str, int, Payload]] = deque(maxlen=_MOST_EVENTS)
         self._closing = threading.Event()
         self._broken = False
-        token = secrets.token_urlsafe(_TOKEN_BYTES)
+        token = options.token()
         config = ViewConfig(options.address, options.port, token, bridge)
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
@@ -102,8 +80,7 @@ class LiveFeed:
         except BaseException:
             self._end()
             raise
-        shown = LOOPBACK if options.address in ("0.0.0.0", "::") else options.address
-        self.url = f"http://{shown}:{self.port}/?token={token}"
+        self.url = options.url(self.port, token)
         self._socket.setblocking(False)
         self._thread = threading.Thread(target=self._run, name="live", daemon=True)
         self._thread.start()
@@ -114,6 +91,11 @@ class LiveFeed:
             self._events.append((topic, stamp_ns, payload))
         else:
             self._newest[topic] = (stamp_ns, payload)
+
+    @property
+    def picture_fd(self) -> int:
+        """Descriptor into which a process that inherits it may send pictures of its own, each as one datagram."""
+        return self._socket.fileno()
 
     def poll(self) -> str | None:
         """Carry out the view's request to stop, if there is one; a view gives no instructions."""

@@ -14,7 +14,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
-from edge.live.feed import LiveError, LiveFeed, LiveOptions
+from edge.live.feed import LiveFeed
+from edge.live.options import LiveError, LiveOptions
 from edge.reasoning.prompt import InstructionError, check_instruction
 from edge.run.arming import RefusedError
 from edge.run.stop_phrase import is_stop_phrase

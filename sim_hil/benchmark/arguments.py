@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from edge.core.cli import check_result_directory, check_result_target
+from edge.live.options import add_live_arguments
 from edge.state.switches import Decoding, RecoverySwitch, Speculation
 from firmware_bridge.system.terminal import CommandParser
 from sim_hil.benchmark.conditions.conditions import (
@@ -125,6 +126,7 @@ def parser() -> argparse.ArgumentParser:
         "--flight-logs", choices=VIDEO_CHOICES, help="episodes of an artifact policy whose flight log is kept and "
         "explained in the report: all, failed (or collided), none (default: failed with --out; lockstep only)",
     )  # fmt: skip
+    add_live_arguments(p)
     p.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     return p
 
