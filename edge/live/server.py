@@ -303,7 +303,8 @@ async def serve(runner: socket.socket) -> None:
         site = web.TCPSite(serving, config.address, config.port, backlog=MOST_CLIENTS)
         await site.start()
     except OSError as error:
-        why = f"cannot listen at {config.address}:{config.port} ({os.strerror(error.errno or 0)}); choose another port"
+        where, reason = f"{config.address}:{config.port}", os.strerror(error.errno or 0)
+        why = f"--live: cannot listen at {where} ({reason}); choose another port"
         runner.send(wire.Datagram(wire.REFUSED, why.encode()).encode())
         await serving.cleanup()
         return

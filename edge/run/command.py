@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import math
 import os
@@ -153,6 +154,8 @@ def read_options(args: argparse.Namespace) -> tuple[RobotConfig, RunOptions]:
             raise ConfigError(f"--record {args.record}: there is no directory {args.record.parent}")
         check_result_target(str(args.record), "--record")
     robot = load_robot_config(args.robot, socket=args.socket, domain=args.domain)
+    if robot.ros2_publish.publish and importlib.util.find_spec("cyclonedds") is None:
+        raise ModuleNotFoundError("No module named 'cyclonedds'", name="cyclonedds")
     options = RunOptions(
         instruction=check_first_instruction(args.instruction),
         mode=Mode(args.mode),
