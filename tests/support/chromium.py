@@ -96,7 +96,14 @@ class Chromium:
     def __init__(self, folder: Path) -> None:
         self._folder = folder / "profile"
         assert EXECUTABLE is not None
-        arguments = ["--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run"]
+        arguments = [
+            "--headless=new",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--disable-dev-shm-usage",
+            "--no-first-run",
+            "--hide-scrollbars",
+        ]
         arguments += ["--remote-debugging-port=0", f"--user-data-dir={self._folder}", "about:blank"]
         self._process = subprocess.Popen(
             [EXECUTABLE, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True

@@ -4,8 +4,8 @@
     python -m tools.bench.live_cost --artifacts out/nano --rounds 0 --memory 1800 --json out/bench/live_memory.json
 
 Real processes on loopback: edge-hil, edge-bridge, the runner, its view, and the viewers in a process of their own on
-the same machine. A round is one drive without the view and one with it, whose blocks are the other three conditions; the
-order of drives and blocks turns from round to round. Of five viewers, two are pages, one is Foxglove with every
+the same machine. A round is one drive without the view and one with it, whose blocks are the other three conditions;
+the order of drives and blocks turns from round to round. Of five viewers, two are pages, one is Foxglove with every
 channel, one reads nothing and one reads 1 kB/s. Ratios are of conditions of one round. A tick is timed from its
 deadline to its command. `--memory`: one more drive with five viewers, in which the memory of runner and view is sampled
 once a second. As in tools.bench.contention, the plan is a circle.

@@ -26,6 +26,13 @@ pytestmark = [
 MOUNT = {"hfov_deg": 100.0, "height_m": 0.4, "pitch_deg": 2.0, "forward_m": 0.3}
 PATH_PX = 40
 """Pixels of the map's dark colours that a drawn robot and path have at least."""
+WAYPOINTS = """(() => {
+  const c = document.getElementById("picture"), d = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
+  let n = 0;
+  for (let i = 0; i < d.length; i += 4) if (d[i] > 200 && d[i + 1] > 110 && d[i + 1] < 170 && d[i + 2] < 60) n++;
+  return n;
+})()"""
+"""Number of the picture's orange pixels."""
 COLOURED = """(id => {
   const c = document.getElementById(id), d = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
   let n = 0;
@@ -63,10 +70,11 @@ class Drive:
             pose = (x, float(np.sin(x)), 0.5 * float(np.cos(x)))
             self.feed.put("/camera", now, picture)
             self.feed.put("/tick", now, self._tick(number, now, pose))
-            if number == 3:
+            if number % 20 == 3:
                 text = "Scene: a corridor.\nPlan: go on to the lift."
-                semantic = {"text": text, "waypoints": [[1.0, 0.2], [2.5, 0.6]], "anchor_pose": pose, "new_tokens": 9}
+                semantic = {"text": text, "waypoints": [[3.0, 0.4], [6.0, 1.2]], "anchor_pose": pose, "new_tokens": 9}
                 self.feed.put("/semantic", now, {**semantic, "started_ns": begin, "finished_ns": now})
+            if number == 3:
                 fault = {"name": "camera-stale", "action": "LIMIT", "change": "raised", "detail": "0.4 s"}
                 self.feed.put("/fault", now, fault)
             self.feed.poll()
@@ -78,7 +86,7 @@ class Drive:
             "tick": number, "now_ns": now, "late_ms": 0.4, "duration_ms": 12.0, "delay_s": 0.5 + number % 20 / 10,
             "frame_age_ms": 50.0, "pose": pose, "trajectory": [(0.8, 0.1, 0.1), (1.6, 0.3, 0.2), (2.4, 0.5, 0.2)],
             "command": (0.6, 0.0, 0.1), "state": (0.55, 0.0, 0.1), "active": ["camera-stale"], "reason": "",
-            "supervisor": "DEGRADED", "offset": (0.5, 0.0, 0.1), "offset_sd": (0.06, 0.03, 0.01),
+            "supervisor": "DEGRADED", "offset": (0.5, 0.0, 0.1), "offset_sd": (0.25, 0.15, 0.01),
         }  # fmt: skip
 
 
@@ -98,6 +106,7 @@ def chromium(tmp_path: Path) -> Iterator[Chromium]:
 async def drawn(page: Page) -> None:
     await page.until('document.getElementById("link").textContent === "live"')
     await page.until(f'{COLOURED}("picture") > 50000')
+    await page.until(f"{WAYPOINTS} > 50")
     await page.until(f'{COLOURED}("map") > {PATH_PX}')
     await page.until(f'{COLOURED}("plots") > 200')
 
