@@ -16,6 +16,8 @@ from sim_hil.benchmark.results.store import EPISODES, FLIGHTS, VIDEOS
 from sim_hil.benchmark.suite.episode import Episode, SuiteError
 
 VIDEO_CHOICES = ("all", "failed", "none")
+FLIGHT_CHOICES = (*VIDEO_CHOICES, "causes")
+"""Flight logs to keep; `causes`: none, but the cause of each failure."""
 
 
 @dataclass(frozen=True)
@@ -31,9 +33,9 @@ class EpisodeTask:
     attempt: int = 1
 
     def __post_init__(self) -> None:
-        for name, choice in (("video", self.video), ("flights", self.flights)):
-            if choice not in VIDEO_CHOICES:
-                raise ConditionsError(f"{name} {choice!r}: expected one of {', '.join(VIDEO_CHOICES)}")
+        for name, choice, known in (("video", self.video, VIDEO_CHOICES), ("flights", self.flights, FLIGHT_CHOICES)):
+            if choice not in known:
+                raise ConditionsError(f"{name} {choice!r}: expected one of {', '.join(known)}")
         wordings = len(self.episode.instructions)
         if self.conditions.wording >= wordings:
             raise ConditionsError(
