@@ -41,6 +41,7 @@ _PRESSES: Final = (
     "emergency stop by an operator",
     "emergency stop pressed at the local input",
     "emergency stop pressed on the remote",
+    "a person has changed the robot's mode",
 )
 _STILL_MOVING: Final = "THE ROBOT STILL MOVES: stop it with its own remote"
 _NO_RUNNER: Final = "operator's arm refused: no runner asks to arm; start edge-run or read its last line, then repeat"
@@ -75,7 +76,7 @@ class BridgeCore:
         self._watch = DangerWatch(safety, table, self._state_timeout_ns)
         self._permit = OperatorPermit(safety.operator_arm, latch)
         self._had_client = self._ever_armed = self._released = False
-        self._pressed = (False, False, False)
+        self._pressed = (False, False, False, False)
         self._pressed_ns = _NEVER_NS
         self._asleep_ns: int | None = None
         self._stop_sent_ns = self._stopped_ns = self._asked_ns = _NEVER_NS
@@ -146,7 +147,7 @@ class BridgeCore:
     def _handle_operator(self, inputs: Inputs, now_ns: int) -> None:
         """Handle emergency stops of every source, then an operator's arm or release; a stop takes precedence."""
         stop = any(isinstance(message, Stop) for message in inputs.operator)
-        pressed = (stop, inputs.estop, inputs.robot.remote_estop)
+        pressed = (stop, inputs.estop, inputs.robot.remote_estop, inputs.robot.taken_over)
         for is_pressed, reason in zip(pressed, _PRESSES, strict=True):
             if is_pressed:
                 self._permit.hold(reason)

@@ -15,7 +15,8 @@ class Report:
     """Messages from the robot's network since the last step.
 
     `remote_in_use`: a person drives the robot by its remote, or has switched it to a mode of the remote.
-    `remote_estop`: the robot's own emergency stop was pressed. `foreign` names a motion or mode request of another
+    `remote_estop`: the robot's own emergency stop was pressed. `taken_over`: a person has changed the mode of the robot
+    while the bridge drove it; it latches like an emergency stop. `foreign` names a motion or mode request of another
     client. `denied` names a request of ours that the robot denied because another client holds its lease. `publishers`
     names the input that has more than one publisher. `version` is the robot's answer to `Identify`. `writes_fail`: the
     network has refused our last commands. `unsafe` names a property of the robot that forbids motion, such as a
@@ -32,6 +33,7 @@ class Report:
     version: str | None = None
     writes_fail: bool = False
     unsafe: str | None = None
+    taken_over: bool = False
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,8 @@ class ModeWatch:
         self.kind = modes.OTHER
         self.armed = False
         self.yielded = False
+        self.is_taken_over = False
+        """Whether, since the last `take_switched`, a person changed the mode of a rover that the bridge drove."""
         self._autopilot = autopilot
         self._status = 0
         self._custom_mode = 0
@@ -68,13 +70,15 @@ class ModeWatch:
             if asked_ns is None or now_ns - asked_ns > _ASKED_NS:
                 self._switched = self.yielded = True
                 self._asked.clear()
+                # With a failsafe of its own, the autopilot declares a critical state.
+                self.is_taken_over |= self.mode == modes.ARMED_DRIVE and status < _CRITICAL
         self.kind, self._custom_mode = kind, custom_mode
         self.armed = bool(base_mode & _ARMED_FLAG)
         self.mode = mode_of(kind, self.armed)
 
     def take_switched(self) -> bool:
         """Return whether a mode change that the bridge did not request was seen since the last call."""
-        switched, self._switched = self._switched, False
+        switched, self._switched, self.is_taken_over = self._switched, False, False
         return switched
 
     def in_use(self) -> bool:

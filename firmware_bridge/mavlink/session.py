@@ -195,7 +195,7 @@ class Session:
         foreign, self._foreign = self._foreign, None
         lost = self.watch.is_lost(now_ns)
         state = self.odometry.state(self.watch, lost=lost)
-        switched = self.watch.take_switched()
+        taken_over, switched = self.watch.is_taken_over, self.watch.take_switched()
         if switched:
             self._tell(f"the rover's mode was changed without the bridge: {self._mode_name()}")
         if state is not None and state.error_code in ERROR_NAMES:
@@ -205,6 +205,7 @@ class Session:
             state=state,
             remote_in_use=switched or self.watch.in_use(),
             remote_estop=self.watch.is_emergency(),
+            taken_over=taken_over,
             foreign=foreign,
             denied=denied,
             publishers=f"another sender uses our number {self._config.station}/{COMPONENT}" if clash else None,

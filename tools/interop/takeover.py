@@ -1,8 +1,9 @@
 """Two ground stations watch a driven rover, MAVSDK and MAVProxy, unmodified; MAVProxy takes it over again and again.
 
 edge-hil is the rover, edge-bridge drives it, a client sends velocities in the runner's place and does not stop sending.
-Each takeover is one mode command of MAVProxy. Measured on the rover's side: the time from the arrival of the mode
-command to the first zero setpoint of the bridge after which no other one follows.
+Each takeover is one mode command of MAVProxy; the bridge latches, and an operator's arm gives it the rover back.
+Measured on the rover's side: the time from the arrival of the mode command to the first zero setpoint of the bridge
+after which no other one follows.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -122,8 +123,13 @@ class Trace:
         return len(last) >= _MOVING_SETPOINTS and all(any(row["velocity"]) for row in last[-_MOVING_SETPOINTS:])
 
 
-def take_over(proxy: MavProxy, client: Client, trace: Trace, host: HostStall, mode: tuple[str, str]) -> Takeover:
-    """Let MAVProxy change the mode once, judge, and give the rover back. Raises StepError, RuntimeError."""
+def take_over(
+    proxy: MavProxy, client: Client, trace: Trace, host: HostStall, mode: tuple[str, str], arm: Sequence[str]
+) -> Takeover:
+    """Let MAVProxy change the mode once, judge, and give the rover back. Raises StepError, RuntimeError.
+
+    `arm`: the operator's command that ends the latch.
+    """
     name, numbers = mode
     wait(trace.is_driven, "a driven rover")
     client.asks = False
@@ -144,6 +150,9 @@ def take_over(proxy: MavProxy, client: Client, trace: Trace, host: HostStall, mo
         wrong.append("the bridge requested a mode after the takeover")
     proxy.type("disarm", r"COMPONENT_ARM_DISARM: ACCEPTED")
     client.asks = True
+    wait(lambda: client.status is not None and client.status.permit == "needed", "request for an operator's arm")
+    # Refused until the rover has left the mode of the remote for a second.
+    wait(lambda: subprocess.run(arm, capture_output=True, timeout=_TIMEOUT_S, check=False).returncode == 0, "arming")
     latency_ms = None if zero_ns is None else (zero_ns - effect_ns) / 1e6
     stall_ms = 0.0 if zero_ns is None else host.between_ns(effect_ns, zero_ns) / 1e6
     return Takeover(name, latency_ms, stall_ms, "" if status is None else status.cause, wrong)
@@ -198,6 +207,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         hil = [*COMMANDS["edge-hil"], *robot.hil_arguments(address), *options]
         started(children, "edge-hil", hil, READY_LINE)
         started(children, "edge-bridge", [*COMMANDS["edge-bridge"], "--robot", str(robot_file)], "ready")
+        arm = [*COMMANDS["edge-bridge"], "arm", "--robot", str(robot_file)]
         trace = Trace(folder / "trace.jsonl")
         proxy = MavProxy(str(args.mavproxy), ports[0], str(folder))
         client = Client(folder / BRIDGE_SOCKET)
@@ -205,7 +215,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
             with mavsdk(args.mavsdk_python, ports[1]) as watched:
                 proxy.type("", r"(?i)detected vehicle 1:1.*|online system 1.*")
                 for number, mode in zip(range(args.repeat), itertools.cycle(MODES), strict=False):
-                    taken.append(take_over(proxy, client, trace, host, mode))
+                    taken.append(take_over(proxy, client, trace, host, mode, arm))
                     latency = "never" if taken[-1].latency_ms is None else f"{taken[-1].latency_ms:.0f} ms"
                     _print(f"{number + 1}/{args.repeat} {mode[0]}: {latency} {'; '.join(taken[-1].wrong)}")
                 position = proxy.type("status", r"LOCAL_POSITION_NED[^\n]*")

@@ -108,12 +108,16 @@ class Snapshot:
 
 
 def heartbeat(vehicle: Vehicle, autopilot: Autopilot = PX4) -> Message:
-    """Return the heartbeat; it announces an autopilot whose modes clients know."""
+    """Return the heartbeat; it announces an autopilot whose modes clients know.
+
+    An active failsafe of an armed rover is a critical state, as with PX4 (its HEARTBEAT stream) and ArduPilot.
+    """
     base_mode = vehicle.mode.base_flags | (common.MAV_MODE_FLAG_SAFETY_ARMED if vehicle.armed else 0)
     if vehicle.estop:
         status = common.MAV_STATE_EMERGENCY
     else:
-        status = common.MAV_STATE_ACTIVE if vehicle.armed else common.MAV_STATE_STANDBY
+        armed = common.MAV_STATE_CRITICAL if vehicle.failsafe else common.MAV_STATE_ACTIVE
+        status = armed if vehicle.armed else common.MAV_STATE_STANDBY
     return common.MAVLink_heartbeat_message(
         common.MAV_TYPE_GROUND_ROVER, autopilot.number, base_mode, autopilot.custom_mode(vehicle.mode), status, 3
     )

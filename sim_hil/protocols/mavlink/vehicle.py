@@ -107,6 +107,8 @@ class Vehicle:
         self.armed = False
         self.mode = Mode.HOLD
         self.estop = False
+        self.failsafe = False
+        """Whether a failsafe has left the rover in its mode; the next mode ends it."""
         self.button = False
         self.pilot = False
         """A person has switched the remote to MANUAL; when it ends, to HOLD."""
@@ -251,6 +253,7 @@ class Vehicle:
                 self._base.command(*_STOP)
             self.mode = mode
             self.send_text(_SEVERITY_NEWS, f"Mode {mode.name}")
+        self.failsafe = False
         self._next_command_s = now_s
         return ACCEPTED
 
@@ -294,12 +297,12 @@ class Vehicle:
         if self.armed and self._sticks is not None and not self._fresh(self._sticks_s, now_s):
             self._sticks = None
             if self.mode is Mode.MANUAL:
-                self._hold("Failsafe: no sticks, holding")
+                self._fail_safe("Failsafe: no sticks, holding")
         self._drive(now_s)
 
     def _lose_setpoints(self) -> None:
         if not self._stays:
-            self._hold("Failsafe: no setpoints, holding")
+            self._fail_safe("Failsafe: no setpoints, holding")
         elif self._setpoint is not None:
             self._setpoint = None
             self._base.command(*_STOP)
@@ -310,7 +313,7 @@ class Vehicle:
         loss_s = self._parameters["COM_DL_LOSS_T"]
         if silent_s > loss_s and not self._station_lost:
             self._station_lost = True
-            self._hold("Failsafe: ground station lost, holding")
+            self._fail_safe("Failsafe: ground station lost, holding")
         if silent_s > loss_s + self._parameters["COM_DISARM_GCS"]:
             self._disarm("Failsafe: ground station lost, disarmed", _SEVERITY_STOPPED)
             self.controller = None
@@ -324,8 +327,13 @@ class Vehicle:
         self._leave()
         self._base.command(*_STOP)
 
+    def _fail_safe(self, why: str) -> None:
+        self._hold(why)
+        self.failsafe = True
+
     def _leave(self) -> None:
         self.mode = Mode.HOLD
+        self.failsafe = False
         self._setpoint = self._sticks = None
         self._setpoint_s = self._sticks_s = _NEVER_S
         self._offered_s.clear()

@@ -37,6 +37,30 @@ def test_a_change_that_was_not_requested_forbids_mode_commands(mode: int) -> Non
     assert watch.take_switched() and watch.yielded and not watch.may_command()
 
 
+@pytest.mark.parametrize("mode", [MANUAL, HOLD, MISSION])
+def test_a_persons_change_of_a_driven_rovers_mode_is_a_takeover(mode: int) -> None:
+    watch = driven()
+    beat(watch, mode, 2 * S)
+    assert watch.is_taken_over
+    watch.take_switched()
+    assert not watch.is_taken_over
+
+
+@pytest.mark.parametrize("status", [CRITICAL, EMERGENCY, TERMINATED])
+def test_a_failsafe_of_the_autopilot_is_no_takeover(status: int) -> None:
+    watch = driven()
+    beat(watch, HOLD, 2 * S, status=status)
+    assert watch.take_switched() and not watch.is_taken_over
+
+
+def test_a_mode_change_of_a_rover_that_the_bridge_does_not_drive_is_no_takeover() -> None:
+    watch = driven()
+    watch.ask(modes.HOLD, 2 * S)
+    beat(watch, HOLD, 2 * S)
+    beat(watch, MANUAL, 3 * S)
+    assert watch.take_switched() and not watch.is_taken_over
+
+
 def test_a_change_is_reported_once() -> None:
     watch = driven()
     beat(watch, MANUAL, 2 * S)

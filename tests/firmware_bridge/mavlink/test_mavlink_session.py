@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 from pymavlink.dialects.v20 import common
 
+from firmware_bridge.core.link import Arm
 from firmware_bridge.mavlink.session import ARM_DISARM, SET_MODE
 from sim_hil.protocols.mavlink.autopilots import ARDUPILOT
 from sim_hil.protocols.mavlink.vehicle import Mode
@@ -122,8 +123,20 @@ class TestTakeover:
         bench.node.vehicle.pilot = True
         bench.run(1.0)
         moving = [at for at, vx in setpoints(bench, since_ns) if vx]
-        assert bench.status is not None and bench.status.cause == "remote_takeover"
+        assert bench.status is not None and bench.status.cause == "estop"
         assert all(at - since_ns <= 20 * MS for at in moving)
+
+    @pytest.mark.parametrize("autopilot", list(AUTOPILOTS))
+    def test_after_the_pilots_switch_only_an_operators_arm_drives_the_rover_again(self, autopilot: str) -> None:
+        bench = driving(autopilot)
+        bench.node.vehicle.pilot = True
+        bench.run(2.0)
+        bench.node.vehicle.pilot = False
+        bench.ground(command(SET_MODE, 1, *map(float, Mode.HOLD.value)))
+        bench.asking = True
+        assert bench.run(10.0).state != "armed"
+        bench.operator = [Arm()]
+        bench.until(lambda: bench.status is not None and bench.status.state == "armed", 10.0, "armed by the operator")
 
     @pytest.mark.parametrize("autopilot", list(AUTOPILOTS))
     def test_after_the_pilots_switch_no_mode_is_requested(self, autopilot: str) -> None:
@@ -139,6 +152,15 @@ class TestTakeover:
         bench.asking = True
         bench.run(5.0)
         assert bench.mode is Mode.MANUAL and bench.status is not None and bench.status.state != "armed"
+
+    def test_after_a_failsafe_of_the_rover_no_operator_is_needed(self) -> None:
+        bench = driving("px4")
+        bench.to_rover = lost
+        bench.until(lambda: bench.mode is Mode.HOLD, 5.0, "the rover's failsafe")
+        bench.to_rover = whole
+        bench.asking = True
+        bench.until(lambda: bench.mode is Mode.OFFBOARD, 10.0, "an arming")
+        bench.drive()
 
     @pytest.mark.parametrize("mode", [Mode.MANUAL, Mode.HOLD])
     def test_a_mode_of_a_ground_station_ends_the_drive_and_stays(self, mode: Mode) -> None:
@@ -173,13 +195,14 @@ class TestTakeover:
         bench.run(1.0)
         assert bench.mode is Mode.HOLD
 
-    def test_after_a_ground_stations_hold_a_new_arming_drives_again(self) -> None:
+    def test_after_a_ground_stations_hold_an_operators_arm_drives_again(self) -> None:
         bench = driving()
         bench.ground(command(SET_MODE, 1, 4, 3))
-        bench.run(3.0)
         bench.asking = True
+        bench.run(5.0)
+        assert bench.status is not None and bench.status.permit == "needed"
+        bench.operator = [Arm()]
         bench.drive()
-        assert bench.status is not None and bench.status.state == "armed"
 
     @pytest.mark.parametrize("name", list(FOREIGN))
     def test_a_second_commanders_own_packet_ends_the_drive(self, name: str) -> None:

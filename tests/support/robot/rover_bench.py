@@ -87,6 +87,7 @@ class RoverBench:
         self.status: BridgeStatus | None = None
         self.speed: tuple[float, float] | None = None
         self.asking = self.client = True
+        self.operator: list[object] = []  # messages of the next step
         self._seq = 0
 
     @property
@@ -137,7 +138,8 @@ class RoverBench:
             self._seq += 1
             armed = self.status is not None and self.status.state == "armed"
             messages.append(Velocity(self._seq, self.now_ns, self.speed[0] * armed, 0.0, self.speed[1] * armed))
-        outputs = self.core.step(Inputs(messages, self.client, report), self.now_ns)
+        operator, self.operator = self.operator, []
+        outputs = self.core.step(Inputs(messages, self.client, report, operator), self.now_ns)
         for request in outputs.requests:
             self.session.write(request, self.now_ns)
         self.flush()

@@ -84,7 +84,7 @@ def _mavlink(own_ms: float) -> tuple[tuple[Row, ...], tuple[Row, ...]]:
         robot_fault("packets with another key", "mavlink-forged", forger.WRONG_KEY),
         robot_fault("recorded packets again", "mavlink-forged", forger.REPLAYED),
         robot_fault("packets of another system", "mavlink-forged", forger.OTHER_SYSTEM),
-        replace(robot_fault("pilot's mode switch", "emergency-stop", "pilot"), bound=TAKEOVER_MS),
+        replace(robot_fault("pilot's mode switch", "emergency-stop", "pilot"), bound=TAKEOVER_MS, operator_arms=True),
         _second_commander(),
     )
 

@@ -40,7 +40,7 @@ def test_on_an_unsigned_link_another_system_changes_nothing() -> None:
 
 def test_on_an_unsigned_link_a_forged_heartbeat_stops_the_rover() -> None:
     status = attacked("unsigned", None).status
-    assert status is not None and status.cause == "remote_takeover"
+    assert status is not None and status.cause == "estop"
 
 
 def test_on_an_unsigned_link_recorded_packets_never_take_the_rover_from_a_pilot() -> None:
