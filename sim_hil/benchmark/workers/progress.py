@@ -13,7 +13,7 @@ class BenchProgress(Progress):
     """Progress display; pass `watcher` to the run."""
 
     def __init__(self, total: int, done: int, *, blind: bool = False) -> None:
-        """`blind`: show counts and no single episode."""
+        """`blind`: show counts, and no single episode."""
         super().__init__("", bar=True, period_s=None)
         self._blind = blind
         self._episodes, self._ended = total, done
