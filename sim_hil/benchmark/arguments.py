@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from edge.core.cli import check_result_directory, check_result_target
+from edge.live.options import add_live_arguments
 from edge.state.switches import Decoding, RecoverySwitch, Speculation
 from firmware_bridge.system.terminal import CommandParser
 from sim_hil.benchmark.conditions.conditions import (
@@ -126,6 +127,7 @@ def parser() -> argparse.ArgumentParser:
         "explained in the report: all, failed (or collided), none; causes keeps the causes of failures alone (default: "
         "failed with --out, causes for dynanav-fresh; lockstep only)",
     )  # fmt: skip
+    add_live_arguments(p)
     p.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     return p
 

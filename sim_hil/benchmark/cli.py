@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import shutil
+import socket
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ from edge.core.cli import (
     stop_signals,
     write_result,
 )
+from edge.live.options import LiveOptions, live_options
 from firmware_bridge.core.config import ConfigError
 from firmware_bridge.system.terminal import one_line
 from sim_hil.benchmark.arguments import SUBCOMMANDS, check, parser
@@ -92,13 +95,12 @@ def _run(args: argparse.Namespace) -> int:
             raise ConditionsError(f"--episodes: expected an episode of the {robot.hil_robot}, found none")
     episodes = list(reworded(episodes, conditions, lambda: load_suite(args.suite)))
     run = BenchRun.plan(args.suite, episodes, conditions)
-    with _output_directory(args.out) as folder, stop_signals() as stop:
+    with _output_directory(args.out) as folder, _live_view(args, conditions.clock) as live, stop_signals() as stop:
         done = len(read_results(folder)) if args.resume else 0
         with BenchProgress(len(run.episodes), done, blind=is_fresh(args.suite)) as progress:
             execution = execute(
                 run, folder, _backend(args), resume=args.resume, video=args.video,
-                flights=_flight_logs(args), stopped=lambda: bool(stop),
-                watcher=progress.watcher,
+                flights=_flight_logs(args), stopped=lambda: bool(stop), live=live, watcher=progress.watcher,
             )  # fmt: skip
         store, finished, result = execution.store, execution.finished, execution.result
         result["skipped"] = skipped
@@ -134,6 +136,29 @@ def _output_directory(out: Path | None) -> Iterator[Path]:
         yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def _live_view(args: argparse.Namespace, clock: str) -> Iterator[LiveOptions | None]:
+    """Print the one address of all episodes' live views; their runners share its port and token.
+
+    Raises ConfigError or LiveError.
+    """
+    live = live_options(args)
+    if live is None:
+        yield None
+        return
+    if clock != "realtime":
+        raise ConfigError("--live: expected --clock realtime, whose episodes a runner drives")
+    if live.port == 0:
+        with socket.socket() as probe:  # every episode listens at the same port
+            probe.bind((live.address, 0))
+            live = replace(live, port=probe.getsockname()[1])
+    with tempfile.TemporaryDirectory(prefix="edge-bench-live-") as folder:
+        if live.token_file is None:
+            live = replace(live, token_file=Path(folder) / "token")
+        _report_problem(f"live view, while an episode drives: {live.url(live.port, live.token())}", EXIT_DONE)
+        yield live
 
 
 def _write_outputs(args: argparse.Namespace, store: ResultStore, result: dict[str, Any]) -> None:

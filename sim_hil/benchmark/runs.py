@@ -16,6 +16,7 @@ from zlib import crc32
 
 from edge.core.cli import write_whole
 from edge.core.stats import percentiles
+from edge.live.options import LiveOptions
 from firmware_bridge.system.input_file import read_json
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.conditions.rewording import reworded
@@ -89,14 +90,16 @@ class BenchRun:
             "versions": versions(),
         }
 
-    def tasks(self, folder: Path, video: str = "none", flights: str = "none") -> list[EpisodeTask]:
+    def tasks(
+        self, folder: Path, video: str = "none", flights: str = "none", live: LiveOptions | None = None
+    ) -> list[EpisodeTask]:
         """Return one task per episode in the order of their start. Raises ConditionsError.
 
         The longest come first, for an even load; those of the fresh suite in an order without regard to their kind, so
         that the rates of an unfinished run are of a fair sample.
         """
         tasks = [
-            EpisodeTask(episode, self.conditions, folder, video, flights, self.manifest_sha256)
+            EpisodeTask(episode, self.conditions, folder, video, flights, self.manifest_sha256, live=live)
             for episode in self.episodes
         ]
         if is_fresh(self.suite):
@@ -187,6 +190,7 @@ def execute(
     resume: bool,
     video: str = "none",
     flights: str = "none",
+    live: LiveOptions | None = None,
     stopped: Callable[[], bool],
     watcher: RunWatcher | None = None,
 ) -> Execution:
@@ -196,7 +200,7 @@ def execute(
     try:
         store = (ResultStore.resume if resume else ResultStore.create)(directory, run.config())
         before = len(store.results)
-        tasks = run.tasks(store.directory, video, flights)
+        tasks = run.tasks(store.directory, video, flights, live)
         finished = run_all(tasks, backend, store, stopped=stopped, watcher=watcher)
     finally:
         backend.close()
