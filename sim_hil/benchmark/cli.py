@@ -38,6 +38,7 @@ from sim_hil.benchmark.results.report import write_report
 from sim_hil.benchmark.results.store import ResultStore, StoreError, read_results
 from sim_hil.benchmark.runs import RESULT, BenchRun, execute
 from sim_hil.benchmark.suite.episode import SuiteError, load_suite
+from sim_hil.benchmark.suite.strata import is_fresh
 from sim_hil.benchmark.workers.cluster import ClusterError, ClusterJobs
 from sim_hil.benchmark.workers.jobs import Backend, LocalJobs, RefusedRunError
 from sim_hil.benchmark.workers.progress import BenchProgress
@@ -96,11 +97,10 @@ def _run(args: argparse.Namespace) -> int:
     run = BenchRun.plan(args.suite, episodes, conditions)
     with _output_directory(args.out) as folder, _live_view(args, conditions.clock) as live, stop_signals() as stop:
         done = len(read_results(folder)) if args.resume else 0
-        with BenchProgress(len(run.episodes), done) as progress:
+        with BenchProgress(len(run.episodes), done, blind=is_fresh(args.suite)) as progress:
             execution = execute(
                 run, folder, _backend(args), resume=args.resume, video=args.video,
-                flights=args.flight_logs or ("none" if args.out is None else "failed"), stopped=lambda: bool(stop),
-                live=live, watcher=progress.watcher,
+                flights=_flight_logs(args), stopped=lambda: bool(stop), live=live, watcher=progress.watcher,
             )  # fmt: skip
         store, finished, result = execution.store, execution.finished, execution.result
         result["skipped"] = skipped
@@ -112,6 +112,12 @@ def _run(args: argparse.Namespace) -> int:
     if not store.results:
         return _report_problem("no episode has a result: nothing was measured", EXIT_CHECK_FAILED)
     return EXIT_CHECK_FAILED if store.failed else EXIT_DONE
+
+
+def _flight_logs(args: argparse.Namespace) -> str:
+    if args.flight_logs is not None:
+        return str(args.flight_logs)
+    return "none" if args.out is None else "causes" if is_fresh(args.suite) else "failed"
 
 
 def _backend(args: argparse.Namespace) -> Backend:
@@ -171,7 +177,8 @@ def summary_lines(result: dict[str, Any]) -> str:
     """Format a run's summary as a table for the terminal."""
     summary = result["summary"]
     rows = [("all", summary)]
-    rows += [(key, means) for group in ("by_scene", "by_crowd", "by_robot") for key, means in summary[group].items()]
+    groups = [members for group, members in summary.items() if group.startswith("by_")]
+    rows += [(key, means) for members in groups for key, means in members.items()]
     lines = [f"{'':<14}{'episodes':>9}{'SR %':>8}{'SPL %':>8}{'NE m':>8}{'CR %':>8}"]
     for name, means in rows:
         cells = "".join(

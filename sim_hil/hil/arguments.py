@@ -19,9 +19,10 @@ from firmware_bridge.core.config import ConfigError
 from firmware_bridge.system.terminal import CommandParser
 from sim_hil.hil.display import check_display
 from sim_hil.hil.trace import POSE_HZ
+from sim_hil.layouts.scenes import open_scene
 from sim_hil.protocols.registry import FLAGS, check_combination, check_flags, protocols, robots
 from sim_hil.robots.odometry_noise import LEVELS
-from sim_hil.scene.scene import Scene, SceneError, load_scene, scene_names
+from sim_hil.scene.scene import Scene, SceneError, scene_names
 
 MAX_PEOPLE: Final = 500
 MAX_POSE_HZ: Final = 500
@@ -149,7 +150,7 @@ def check(args: argparse.Namespace) -> Scene:
 
 
 def _scene(args: argparse.Namespace) -> Scene:
-    scene = load_scene(args.scene)
+    scene = open_scene(args.scene)
     if args.start is None:
         return scene
     (x_m, y_m, _), (x0, y0), (x1, y1) = args.start, scene.floor_min_m, scene.floor_max_m

@@ -20,11 +20,11 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final, TextIO
 
 from firmware_bridge.system.terminal import CommandParser
+from sim_hil.layouts.scenes import open_scene
 from sim_hil.processes.child_process import Message, input_is_open, take_standard_output, write_message
 from sim_hil.protocols.front_end import FrontEndOptions
 from sim_hil.protocols.render_process import PictureView, RenderProcess, encode_jpeg
 from sim_hil.protocols.snapshot import SnapshotReader, TornSnapshotError
-from sim_hil.scene.scene import load_scene
 from sim_hil.simulation.camera import CameraWorld
 from sim_hil.simulation.sensor_noise import SensorNoise
 
@@ -222,7 +222,7 @@ def main(argv: list[str] | None = None) -> int:
         signal.signal(number, signal.SIG_IGN)
     pipe, shutter, size = take_standard_output(), Shutter(), (args.width, args.height)
     server = CameraServer(socket.socket(fileno=args.listen_fd), shutter)
-    world = CameraWorld(load_scene(args.scene), people=args.people, seed=args.seed, robot=args.robot)
+    world = CameraWorld(open_scene(args.scene), people=args.people, seed=args.seed, robot=args.robot)
     poses = SnapshotReader(args.pose_fd, world.state_size)
     noise = SensorNoise(args.width, args.height, args.seed)
     threading.Thread(target=server.serve_forever, name="camera-http", daemon=True).start()

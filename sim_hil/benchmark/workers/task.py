@@ -17,6 +17,8 @@ from sim_hil.benchmark.results.store import EPISODES, FLIGHTS, VIDEOS
 from sim_hil.benchmark.suite.episode import Episode, SuiteError
 
 VIDEO_CHOICES = ("all", "failed", "none")
+FLIGHT_CHOICES = (*VIDEO_CHOICES, "causes")
+"""Flight logs to keep; `causes`: none, but the cause of each failure."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +36,9 @@ class EpisodeTask:
     """Where the runner's live view listens, in real time."""
 
     def __post_init__(self) -> None:
-        for name, choice in (("video", self.video), ("flights", self.flights)):
-            if choice not in VIDEO_CHOICES:
-                raise ConditionsError(f"{name} {choice!r}: expected one of {', '.join(VIDEO_CHOICES)}")
+        for name, choice, known in (("video", self.video, VIDEO_CHOICES), ("flights", self.flights, FLIGHT_CHOICES)):
+            if choice not in known:
+                raise ConditionsError(f"{name} {choice!r}: expected one of {', '.join(known)}")
         wordings = len(self.episode.instructions)
         if self.conditions.wording >= wordings:
             raise ConditionsError(

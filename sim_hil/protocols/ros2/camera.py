@@ -20,11 +20,11 @@ from firmware_bridge.dds.binding import has_reader
 from firmware_bridge.dds.bus import DDS_ERRORS, Bus
 from firmware_bridge.ros2.messages.sensors import CameraInfo_, CompressedImage_
 from firmware_bridge.system.terminal import CommandParser
+from sim_hil.layouts.scenes import open_scene
 from sim_hil.processes.child_process import input_is_open, take_standard_output, write_message
 from sim_hil.protocols.render_process import PictureView, encode_jpeg
 from sim_hil.protocols.ros2.topics import CAMERA_FRAME, CAMERA_INFO_TOPIC, IMAGE_TOPIC, camera_info, header
 from sim_hil.protocols.snapshot import SnapshotReader, TornSnapshotError
-from sim_hil.scene.scene import load_scene
 from sim_hil.simulation.camera import CameraWorld
 from sim_hil.simulation.sensor_noise import SensorNoise
 
@@ -91,7 +91,7 @@ def main(argv: list[str] | None = None) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     pipe = take_standard_output()
-    world = CameraWorld(load_scene(args.scene), people=args.people, seed=args.seed, robot="carter")
+    world = CameraWorld(open_scene(args.scene), people=args.people, seed=args.seed, robot="carter")
     poses = SnapshotReader(args.pose_fd, world.state_size + 1)
     bus = Bus(DdsConfig(args.domain, args.interface, tuple(args.peer)))
     node = CameraNode(bus, world, poses, SensorNoise(args.width, args.height, args.seed), PictureView(args.view_fd))

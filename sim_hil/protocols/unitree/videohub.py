@@ -17,12 +17,12 @@ from firmware_bridge.core.config import DdsConfig
 from firmware_bridge.dds.bus import Bus
 from firmware_bridge.system.terminal import CommandParser
 from firmware_bridge.unitree.messages import ids
+from sim_hil.layouts.scenes import open_scene
 from sim_hil.processes.child_process import input_is_open, take_standard_output, write_message
 from sim_hil.protocols.render_process import PictureView, encode_jpeg
 from sim_hil.protocols.snapshot import SnapshotReader
 from sim_hil.protocols.unitree.services.service import ServiceServer
 from sim_hil.protocols.unitree.video_service import VideoHub
-from sim_hil.scene.scene import load_scene
 from sim_hil.simulation.camera import CameraWorld
 from sim_hil.simulation.sensor_noise import SensorNoise
 
@@ -50,7 +50,7 @@ def main(argv: list[str] | None = None) -> int:
         signal.signal(number, signal.SIG_IGN)
     report = functools.partial(write_message, take_standard_output())
 
-    world = CameraWorld(load_scene(args.scene), people=args.people, seed=args.seed)
+    world = CameraWorld(open_scene(args.scene), people=args.people, seed=args.seed)
     poses = SnapshotReader(args.pose_fd, world.state_size)
 
     noise = SensorNoise(args.width, args.height, args.seed)
