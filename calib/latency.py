@@ -7,7 +7,6 @@ import datetime
 import json
 import math
 import threading
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -90,6 +89,9 @@ def run(args: argparse.Namespace) -> int:
         f"{result['generations']} generations, mean {result['mean_s']:.3f} s, p50 {generation['p50']:.3f} s, "
         f"p99 {generation['p99']:.3f} s, max {generation['max']:.3f} s ({profile.tagged})"
     )
+    if profile.call_s:
+        calls = ", ".join(f"{rows}: {1e3 * time_s:.2f}" for rows, time_s in profile.call_s)
+        _print(f"decoding calls by number of rows, ms: {calls}")
     if measured is not None:
         _print(f"control beside it: {measured.ticks} ticks, {measured.late} of them late")
     _print(f"wrote {args.out}: edge-bench --latency profile:{args.out}, edge-train --delay-profile {args.out}")
@@ -137,7 +139,11 @@ def _measured(args: argparse.Namespace) -> tuple[LatencyProfile, Measured]:
     )
     if not times:
         raise MeasureError("no generation was finished: give it more --seconds")
-    return replace(LatencyProfile(machine, source, times, anchors), tagged=MEASURED), measured
+    call_s = measured.call_s
+    rest_s = tuple(
+        time_s - decoding.after_first_s for time_s, decoding in zip(times, measured.decoding, strict=True) if call_s
+    )
+    return LatencyProfile(machine, source, times, anchors, MEASURED, call_s, rest_s), measured
 
 
 def summary(profile: LatencyProfile, out: Path, measured: Measured | None) -> dict[str, Any]:
@@ -151,6 +157,7 @@ def summary(profile: LatencyProfile, out: Path, measured: Measured | None) -> di
         "mean_s": profile.mean_s,
         "generation_s": percentiles(times, "p50", "p99", "max"),
         "anchor_after_s": percentiles(list(profile.anchor_after_s), "p50", "p99", "max"),
+        "call_s": {str(rows): time_s for rows, time_s in profile.call_s},
         "control": None if measured is None else {"ticks": measured.ticks, "late": measured.late},
         "failed": 0 if measured is None else measured.failed,
         "tagged": profile.tagged,

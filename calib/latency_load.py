@@ -19,6 +19,7 @@ from edge.inference.language import ContextOverflowError, LanguageModel
 from edge.inference.latency_profile import times_of
 from edge.inference.policy import Policy
 from edge.inference.scheduling import GiveWay, Schedule, TickActivity, enter, schedule_for
+from edge.inference.speculation import next_rows
 from edge.inference.warm_up import warm_up
 from edge.reasoning.generation_cycle import Mode, ReasoningConfig
 from edge.run.reasoning_loop import ReasoningLoop, ReasoningOutputs, ReasoningSchedule
@@ -39,6 +40,14 @@ class MeasureError(RuntimeError):
 
 
 @dataclass(frozen=True)
+class Decoding:
+    """Time of a generation's decoding calls after its first token, s, and the tokens that each call fed."""
+
+    after_first_s: float
+    call_tokens: tuple[int, ...]
+
+
+@dataclass(frozen=True)
 class Measured:
     """Measurement: (generation time, time from its start to its newest frame), s, and the ticks beside it."""
 
@@ -47,6 +56,25 @@ class Measured:
     late: int
     """Number of ticks that ended after the next one's deadline."""
     failed: int
+    decoding: tuple[Decoding, ...]
+    """Decoding of each of the generations."""
+    call_ns: Mapping[int, float]
+    """Duration of a decoding call alone by its permitted number of rows, ns; without guesses all equal."""
+
+    @property
+    def call_s(self) -> tuple[tuple[int, float], ...]:
+        """Duration of a call beside control by its number of rows, s; empty without calls after the first token.
+
+        The durations alone, all times one factor that gives the time that all calls took together.
+        """
+        alone_ns = sum(self.call_ns[rows] for decoding in self.decoding for rows in self._rows(decoding))
+        if not alone_ns:
+            return ()
+        factor = sum(decoding.after_first_s for decoding in self.decoding) / alone_ns
+        return tuple((rows, self.call_ns[rows] * factor) for rows in sorted(self.call_ns))
+
+    def _rows(self, decoding: Decoding) -> list[int]:
+        return [next_rows(sorted(self.call_ns), tokens) for tokens in decoding.call_tokens[1:]]
 
 
 @dataclass
@@ -54,10 +82,12 @@ class Generations:
     """Collects the records of generations in place of a flight log."""
 
     times_s: list[tuple[float, float]] = field(default_factory=list)
+    decoding: list[Decoding] = field(default_factory=list)
 
     def put(self, topic: str, _stamp_ns: int, record: Mapping[str, Any]) -> None:
         """Store the times of a finished generation."""
         if topic == "/semantic":
+            self.decoding.append(Decoding(record["decode_ms"] / 1e3, tuple(record["call_tokens"])))
             self.times_s.append(times_of(record))
 
 
@@ -164,7 +194,10 @@ def measure(
     why = ticks.error or reasoning.cycle.failure
     if why:
         raise MeasureError(f"it ended by itself: {why}")
-    return Measured(tuple(found.times_s[WARM:]), ticks.ticks, ticks.late, reasoning.cycle.failed)
+    count = len(found.times_s)
+    times_s, decoding = tuple(found.times_s[WARM:]), tuple(found.decoding[WARM:count])
+    call_ns = dict.fromkeys(language.rows, 1.0) if language.speculator is None else language.speculator.call_ns
+    return Measured(times_s, ticks.ticks, ticks.late, reasoning.cycle.failed, decoding, call_ns)
 
 
 def _wait(found: Generations, wanted: int, seconds: float, stop: threading.Event, say: Callable[[str], None]) -> None:

@@ -32,6 +32,8 @@ LANGUAGE_WHOLE = ("language_model",)
 LANGUAGE_PAIR = ("language_model.prefill", "language_model.decode")
 MOST_ROWS = 16
 """Most positions of one call whose next token a language graph chooses."""
+LEAST_ROWS = 2
+"""Least rows of a call that chooses tokens: products of one row use other kernels, which sum in another order."""
 MAX_ELEMENTS = 1 << 31
 """Elements of a tensor's fixed axes; a larger one would be allocated before the graph is proven."""
 MAX_CACHE_BYTES = 16 << 30

@@ -71,6 +71,13 @@ def link_rights(robot: RobotConfig, group_of: Callable[[Path], str | None] | Non
         secret = robot.mavlink.signing_key
         if device is None:
             host = _address("mavlink.link", robot.mavlink.link.split(":")[1])
+    if robot.ros2_publish.publish:
+        interface = robot.ros2_publish.network(robot.dds).interface
+        if robot.dds is None or interface != robot.dds.interface:
+            raise UnitError(
+                f"ros2.publish_interface: a service reaches the robot's network alone, found {interface!r}; expected"
+                " the interface of [dds], or ros2.publish = false in the service's robot file"
+            )
     kind, _, where = robot.camera.source.partition(":")
     camera_host: IPv4Network | None = None
     cameras: tuple[str, ...] = ()

@@ -96,6 +96,7 @@ SCHEMAS: Mapping[str, Schema] = {
             "stop",
             "max_new_tokens",
             "decode_calls",
+            "call_tokens",
         ),
         generation=_INT,
         instruction=_TEXT,  # the run's, or another that was given later
@@ -120,6 +121,7 @@ SCHEMAS: Mapping[str, Schema] = {
         max_new_tokens=_INT,
         new_tokens=_INT,
         decode_calls=_INT,  # calls that chose the new tokens
+        call_tokens={"type": "array", "items": _INT},  # tokens that each of them fed: the last one and the guesses
         text=_TEXT,
         waypoints=_ROWS_OR_NULL,
         prefill_ms=_NUMBER,

@@ -145,7 +145,8 @@ class GenerationTask:
             "stop": None if stop is None else stop.as_tuple(),
             "prompt_tokens": result.generation.prompt_tokens,
             "new_tokens": result.generation.new_tokens,
-            "decode_calls": result.generation.decode_calls,
+            "decode_calls": len(result.generation.call_tokens),
+            "call_tokens": result.generation.call_tokens,
             "text": result.generation.text,
             "waypoints": result.waypoints,
         }

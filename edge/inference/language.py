@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -16,13 +16,13 @@ import onnxruntime as ort
 from tokenizers import Tokenizer
 
 from edge.artifacts.files import ArtifactError
-from edge.artifacts.manifest import MOST_ROWS, Artifacts
+from edge.artifacts.manifest import LEAST_ROWS, MOST_ROWS, Artifacts
 from edge.artifacts.tokenizer_file import MAX_TOKENS
 from edge.core.geometry import SE2
 from edge.inference.calls import Call, Chunk, Floats, chunks, set_first_apart, set_last_apart
 from edge.inference.graph import DTYPES, CancelledError, Graph, GraphError, Interrupt, zeros
 from edge.inference.scheduling import Schedule, run_as
-from edge.inference.speculation import FIRST_TEXT, LEAST_ROWS, Speculator, TextUnderWay, exact_calls_ns, next_rows
+from edge.inference.speculation import FIRST_TEXT, Speculator, TextUnderWay, exact_calls_ns, next_rows
 from edge.reasoning.decoding_rules import DecodingContext, TextConstraint
 from edge.reasoning.prompt import (
     EXAMPLE_BEFORE,
@@ -54,8 +54,8 @@ class Generation:
     prompt_tokens: int
     prefill_ms: float
     decode_ms: float
-    decode_calls: int
-    """Calls that chose the new tokens; without speculation one a token, and one for the token after them."""
+    call_tokens: tuple[int, ...]
+    """Tokens fed by each call of the decode graph; without speculation one, and one call for the token after them."""
     guessed: int
     """Guesses that were compared with the model's choice."""
     accepted: int
@@ -210,10 +210,15 @@ class LanguageModel:
                 "so guesses could change the text"
             )
         self._took_ns |= call_ns
+        self.rows = tuple(sorted(call_ns))
+        self.guess_for(call_ns)
+        return None
+
+    def guess_for(self, call_ns: Mapping[int, float]) -> None:
+        """Forget earlier texts, and guess for a device with these durations of a call by its number of rows, ns."""
+        first = self.tokenizer.encode(FIRST_TEXT, add_special_tokens=False).ids
         is_number = cache(lambda token: any(character.isdigit() for character in self.text_of([token])))
         self.speculator = Speculator(first, call_ns, self.ends_line, is_number)
-        self.rows = self.speculator.rows
-        return None
 
     def run(self, call: Call, chunk: Chunk, past: int, interrupt: Interrupt | None) -> list[int]:
         """Feed a chunk after `past` tokens; return what `Call` does. Raises GraphError."""
@@ -295,7 +300,7 @@ class GenerationRun:
             prompt_tokens=prompt_tokens,
             prefill_ms=(self._prefill_ns + prefilled_ns - started_ns) / 1e6,
             decode_ms=(time.monotonic_ns() - prefilled_ns) / 1e6,
-            decode_calls=text.calls,
+            call_tokens=tuple(text.call_tokens),
             guessed=text.guessed,
             accepted=text.accepted,
         )
@@ -306,16 +311,17 @@ class GenerationRun:
         Returns the tokens to feed next; [] at the end of the text.
         """
         model = self._model
-        most = model.rows[-1]
+        most = model.rows[-1] if model.speculator is None else model.speculator.rows[-1]
         while len(pending) > most:
             self._run_rows(pending[:most])
+            text.call_tokens.append(most)
             self._fed += most
             pending = pending[most:]
         speculator = model.speculator
         guesses = [] if speculator is None else speculator.guess(text, len(pending), self._longest_guess_ns())
         choices = self._run_rows([*pending, *guesses])[len(pending) - 1 :]
         self._fed += len(pending)
-        text.calls += 1
+        text.call_tokens.append(len(pending) + len(guesses))
         for choice, guess in zip(choices, [*guesses, None], strict=False):
             if len(text.ids) >= text.limit:
                 return []

@@ -2,7 +2,10 @@
 
 A profile file (JSON or TOML) has `schema = 1`, `name`, `source` (the measured device) and `generation_s`, a list of
 times, s. Optional are `anchor_after_s`, of the same length: time from a generation's start to the capture of its newest
-frame; and `tagged`: measured or modelled. A flight log or the result of an `edge-run` is read directly.
+frame; `tagged`: measured or modelled; and, together, `call_s` and `rest_s`. `call_s` has the duration of a decoding
+call by its number of rows, such as {"2": 0.021, "8": 0.024}, and `rest_s` each generation's time without the calls
+after its first token. Virtual time then adds up the calls that a text takes. A flight log or the result of an
+`edge-run` is read directly.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from edge.artifacts.manifest import LEAST_ROWS, MOST_ROWS
 from edge.flightlog.reader import RecordingError, read_messages
 from edge.inference.release import MAX_DELAY_S
 from edge.power.meters.meter import MEASURED, MODELLED
@@ -26,7 +30,7 @@ MAX_BYTES = 16_000_000
 QUANTILE_STEPS = 200
 """Number of times drawn from a distribution that is given by percentiles only."""
 _POINTS = ("p50", "p99", "max")
-_KEYS = ("schema", "name", "source", "generation_s", "anchor_after_s", "tagged")
+_KEYS = ("schema", "name", "source", "generation_s", "anchor_after_s", "tagged", "call_s", "rest_s")
 
 
 class LatencyError(ValueError):
@@ -45,6 +49,10 @@ class LatencyProfile:
     """Time from a generation's start to its newest frame, s; empty: 0 for all."""
     tagged: str = MODELLED
     """MEASURED for times of a device, MODELLED for set or scaled numbers."""
+    call_s: tuple[tuple[int, float], ...] = ()
+    """Ascending numbers of rows of a decoding call with its duration, s; 1 row only: the device guesses nothing."""
+    rest_s: tuple[float, ...] = ()
+    """Each generation's time without the decoding calls after its first token, s; empty without `call_s`."""
 
     def __post_init__(self) -> None:
         times, anchors = self.generation_s, self.anchor_after_s
@@ -58,6 +66,23 @@ class LatencyProfile:
             raise LatencyError("latency: expected every anchor_after_s from 0 to its generation's time")
         if self.tagged not in (MEASURED, MODELLED):
             raise LatencyError(f"latency: expected tagged to be {MEASURED} or {MODELLED}, found {self.tagged!r}")
+        if self.call_s or self.rest_s:
+            self._check_calls()
+
+    def _check_calls(self) -> None:
+        rows, times = [rows for rows, _ in self.call_s], [time_s for _, time_s in self.call_s]
+        if rows != [1] and (rows != sorted(set(rows)) or rows[:1] != [LEAST_ROWS] or rows[-1] > MOST_ROWS):
+            raise LatencyError(
+                f"latency: expected call_s to have calls of 1 row, or of {LEAST_ROWS} and more up to {MOST_ROWS} rows, "
+                f"found {rows}"
+            )
+        if not all(0 < time_s <= MAX_DELAY_S for time_s in times):
+            raise LatencyError(f"latency: expected call_s above 0 and up to {MAX_DELAY_S:g} s, found one outside")
+        if len(self.rest_s) != len(self.generation_s):
+            raise LatencyError(f"latency: expected as many rest_s as generation_s, found {len(self.rest_s)}")
+        anchors = self.anchor_after_s or (0.0,) * len(self.rest_s)
+        if not all(a <= rest_s <= MAX_DELAY_S for a, rest_s in zip(anchors, self.rest_s, strict=True)):
+            raise LatencyError(f"latency: expected rest_s from its anchor_after_s to {MAX_DELAY_S:g} s")
 
     @staticmethod
     def constant(seconds: float) -> LatencyProfile:
@@ -69,6 +94,15 @@ class LatencyProfile:
         """Mean generation time."""
         return sum(self.generation_s) / len(self.generation_s)
 
+    def decode_s(self, call_tokens: Sequence[int]) -> float:
+        """Return the duration of decoding calls that feed so many tokens each, s; longer ones are split."""
+        most, longest_s = self.call_s[-1]
+        total_s = 0.0
+        for tokens in call_tokens:
+            whole, left = divmod(tokens, most)
+            total_s += whole * longest_s + (next(s for rows, s in self.call_s if rows >= left) if left else 0.0)
+        return total_s
+
     def scaled_to_mean(self, mean_s: float) -> LatencyProfile:
         """Return a modelled profile of the same shape with another mean; raises LatencyError."""
         if not (math.isfinite(mean_s) and mean_s > 0 and self.mean_s > 0):
@@ -77,11 +111,15 @@ class LatencyProfile:
         scaled = tuple(min(time_s * factor, MAX_DELAY_S) for time_s in self.generation_s)
         anchors = tuple(min(a * factor, t) for a, t in zip(self.anchor_after_s, scaled, strict=False))
         source = f"{self.source}; scaled by {factor:.4g} to a mean of {mean_s:g} s"
-        return LatencyProfile(f"{self.name}, {mean_s:g} s", source, scaled, anchors, MODELLED)
+        call_s = tuple((rows, time_s * factor) for rows, time_s in self.call_s)
+        rest_s = tuple(time_s * factor for time_s in self.rest_s)
+        return LatencyProfile(f"{self.name}, {mean_s:g} s", source, scaled, anchors, MODELLED, call_s, rest_s)
 
     def as_json(self) -> dict[str, Any]:
         """What `of_json` reads."""
-        return {"schema": SCHEMA, **asdict(self)}
+        content = {"schema": SCHEMA, **asdict(self), "call_s": {str(rows): time_s for rows, time_s in self.call_s}}
+        # Without calls the content is that of earlier releases, whose runs can so be continued.
+        return content if self.call_s else {k: v for k, v in content.items() if k not in ("call_s", "rest_s")}
 
     @staticmethod
     def of_json(content: object) -> LatencyProfile:
@@ -99,6 +137,8 @@ class LatencyProfile:
             _times(content.get("generation_s"), "generation_s"),
             _times(content.get("anchor_after_s", []), "anchor_after_s"),
             str(content.get("tagged", MODELLED)),
+            _calls(content.get("call_s", {})),
+            _times(content.get("rest_s", []), "rest_s"),
         )
 
 
@@ -164,6 +204,14 @@ def _times(value: object, key: str) -> tuple[float, ...]:
     if not isinstance(value, Sequence) or isinstance(value, str) or not all(_is_number(item) for item in value):
         raise LatencyError(f"expected {key} to be a list of seconds")
     return tuple(float(item) for item in value)
+
+
+def _calls(value: object) -> tuple[tuple[int, float], ...]:
+    if not isinstance(value, Mapping) or not all(
+        str(rows).isdecimal() and _is_number(time_s) for rows, time_s in value.items()
+    ):
+        raise LatencyError('expected call_s to have seconds by number of rows, such as {"2": 0.021, "8": 0.024}')
+    return tuple(sorted((int(rows), float(time_s)) for rows, time_s in value.items()))
 
 
 def _is_number(value: object) -> bool:

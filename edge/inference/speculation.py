@@ -20,7 +20,7 @@ from typing import Final
 
 import numpy as np
 
-from edge.artifacts.manifest import MOST_ROWS
+from edge.artifacts.manifest import LEAST_ROWS, MOST_ROWS
 from edge.inference.calls import Call, Chunk, Floats
 from edge.reasoning.decoding_rules import TextConstraint
 from edge.state.reasoning_text import (
@@ -36,8 +36,6 @@ from edge.state.reasoning_text import (
     format_text,
 )
 
-LEAST_ROWS: Final = 2
-"""Least rows of a call that chooses tokens."""
 MEMORY: Final = 200.0
 """Number of recent guesses that determine the acceptance."""
 FIRST_TEXT: Final = format_text(
@@ -65,21 +63,19 @@ def exact_calls_ns(call: Call, kv: Floats, past: int, ids: Sequence[int]) -> dic
         call(Chunk(tuple(ids[i : i + LEAST_ROWS]), None, 0), past + i, kv, None)
         expected_logits[i : i + LEAST_ROWS] = call.logits[:LEAST_ROWS]
     expected_kv = kv[:, past : past + len(ids)].copy()
-    exact: dict[int, int] = {}
-    for rows in range(LEAST_ROWS, MOST_ROWS + 1):
-        took_ns: list[int] = []
-        for _ in range(2):
+    took_ns: dict[int, list[int]] = {rows: [] for rows in range(LEAST_ROWS, MOST_ROWS + 1)}
+    # Twice, in turn: what disturbs one measurement of a number of rows seldom disturbs the other.
+    for _ in range(2):
+        for rows in tuple(took_ns):
             started_ns = monotonic_ns()
             call(Chunk(tuple(ids[:rows]), None, 0), past, kv, None)
-            took_ns.append(monotonic_ns() - started_ns)
+            took_ns[rows].append(monotonic_ns() - started_ns)
             if not (
                 np.array_equal(kv[:, past : past + rows], expected_kv[:, :rows])
                 and np.array_equal(call.logits[:rows], expected_logits[:rows])
             ):
-                break
-        else:
-            exact[rows] = min(took_ns)
-    return exact
+                del took_ns[rows]
+    return {rows: min(times) for rows, times in took_ns.items()}
 
 
 def next_rows(permitted: Sequence[int], tokens: int) -> int:
@@ -99,7 +95,8 @@ class TextUnderWay:
     ids: list[int] = field(default_factory=list)
     line_at: int = 0
     """Index of the current line's first token."""
-    calls: int = 0
+    call_tokens: list[int] = field(default_factory=list)
+    """Tokens fed by each call."""
     guessed: int = 0
     """Guesses that were compared with the model's choice."""
     accepted: int = 0
@@ -221,6 +218,8 @@ class Speculator:
         """Permitted numbers of rows."""
         # By the number of tokens, padded to the next permitted number. A longer measurement of a shorter call is noise.
         self._call_ns = [min(call_ns[rows] for rows in self.rows if rows >= n) for n in range(1, self.rows[-1] + 1)]
+        self.call_ns = {rows: self._call_ns[rows - 1] for rows in self.rows}
+        """Duration of a call by its number of rows, ns; a longer call takes as long or longer."""
         # Accepted and all guesses, of other tokens and of numbers; the start is soon outweighed.
         self._counts = [[9.0, 10.0], [6.0, 10.0]]
 

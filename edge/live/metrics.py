@@ -65,6 +65,10 @@ class Metrics:
                 _set(self._power.labels(str(record["tagged"])), record["total_w"])
                 _set(self._budget, record["budget_w"])
                 _set(self._temperature, record["temperature_c"])
+            elif topic == "/velocity":
+                for kind in ("commanded", "measured"):
+                    _set(self._speed.labels(kind), record[f"{kind}_vx_mps"])
+                    _set(self._yaw.labels(kind), record[f"{kind}_wz_radps"])
             elif topic == "/battery":
                 _set(self._battery, record["soc_percent"])
         except (KeyError, TypeError, ValueError, IndexError):

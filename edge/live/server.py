@@ -40,6 +40,7 @@ STOP_ANSWER_S: Final = 3.0
 EACH_COUNTS: Final = frozenset({*wire.EVENTS, "/log", "/scene"})
 """Topics of which a client gets every message, up to _MOST_WAITING; of all others only the newest."""
 
+_SCHEMA_OF: Final = {**STANDARD_SCHEMAS, **SCHEMAS}
 _MOST_WAITING: Final = 64
 _MOST_FILES: Final = 128  # also the most connections: a flood fills them, not the memory
 _NICENESS: Final = 10
@@ -127,7 +128,7 @@ class LiveServer:
                 record = json.loads(datagram.payload)
                 self._metrics.take(topic, record)
                 self._show(self._state.record(topic, stamp_ns, record))
-                self._offer(topic, stamp_ns, datagram.payload, SCHEMAS.get(topic, ANY_OBJECT))
+                self._offer(topic, stamp_ns, datagram.payload, _SCHEMA_OF.get(topic, ANY_OBJECT))
                 self._offer_standard(topic, stamp_ns, record)
             elif datagram.kind == wire.STOPPED and self._stop_answer is not None and not self._stop_answer.done():
                 self._stop_answer.set_result(json.loads(datagram.payload).get("confirmed") is True)
@@ -167,7 +168,7 @@ class LiveServer:
         if kind != "Bearer":
             given = request.query.get("token", "")
         if not hmac.compare_digest(given.encode(errors="replace"), self._config.token.encode()):
-            raise web.HTTPForbidden(text="the token is missing or wrong: use the address that edge-run printed\n")
+            raise web.HTTPForbidden(text="the token is missing or wrong: use the address that the command printed\n")
         origin = request.headers.get("Origin")
         own = f"{request.scheme}://{request.host}"
         if origin is not None and origin not in (own, *origins):
@@ -179,6 +180,7 @@ class LiveServer:
         self._check(request)
         nonce = secrets.token_urlsafe(12)
         page = files("edge.live").joinpath("page.html").read_text(encoding="utf-8").replace("@NONCE@", nonce)
+        page = page.replace("@STOP@", "hidden" if self._config.bridge is None else "")
         policy = (
             f"default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; img-src blob: data:; "
             "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -256,6 +258,8 @@ class LiveServer:
         self._check(request)
         if not request.headers.get("Authorization"):
             raise web.HTTPForbidden(text="a stop needs the token in the header Authorization\n")
+        if self._config.bridge is None:
+            raise web.HTTPConflict(text="this view stops nothing: use the runner's view, or edge-bridge stop\n")
         code, _ = await asyncio.get_running_loop().run_in_executor(None, operate, "stop", self._config.bridge)
         if code == 0:
             text = "stopped: the robot reports that it stands. Before it moves again: edge-bridge arm"
@@ -299,7 +303,8 @@ async def serve(runner: socket.socket) -> None:
         site = web.TCPSite(serving, config.address, config.port, backlog=MOST_CLIENTS)
         await site.start()
     except OSError as error:
-        why = f"cannot listen at {config.address}:{config.port} ({os.strerror(error.errno or 0)}); choose another port"
+        where, reason = f"{config.address}:{config.port}", os.strerror(error.errno or 0)
+        why = f"--live: cannot listen at {where} ({reason}); choose another port"
         runner.send(wire.Datagram(wire.REFUSED, why.encode()).encode())
         await serving.cleanup()
         return

@@ -55,22 +55,23 @@ def decode(data: bytes) -> Datagram:
 
 @dataclass(frozen=True)
 class ViewConfig:
-    """Where the view listens and whom it lets in; `bridge`: socket of the bridge that its STOP button stops."""
+    """Where the view listens and whom it lets in; `bridge`: socket of the bridge that its STOP button stops, if any."""
 
     address: str
     port: int
     token: str
-    bridge: Path
+    bridge: Path | None
 
     def encode(self) -> bytes:
         """Return the configuration as a payload."""
-        return json.dumps({**asdict(self), "bridge": str(self.bridge)}).encode()
+        return json.dumps({**asdict(self), "bridge": None if self.bridge is None else str(self.bridge)}).encode()
 
     @staticmethod
     def parse(payload: bytes) -> ViewConfig:
         """Read a payload; raises WireError."""
         try:
             found: dict[str, Any] = json.loads(payload)
-            return ViewConfig(str(found["address"]), int(found["port"]), str(found["token"]), Path(found["bridge"]))
+            bridge = None if found["bridge"] is None else Path(found["bridge"])
+            return ViewConfig(str(found["address"]), int(found["port"]), str(found["token"]), bridge)
         except (ValueError, KeyError, TypeError) as error:
             raise WireError(f"no configuration of a live view: {error}") from error

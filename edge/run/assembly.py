@@ -16,7 +16,7 @@ from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
 from edge.inference.release import ReleaseDelay
 from edge.inference.scheduling import GiveWay, Schedule, TickActivity
-from edge.live.feed import LiveOptions
+from edge.live.options import LiveOptions
 from edge.motion.controller import Controller, ControllerConfig
 from edge.power.governor.plan import read_power_plan
 from edge.power.monitor import Activity, PowerMonitor

@@ -32,7 +32,7 @@ from edge.core.cli import (
 from edge.flightlog.reader import parts
 from edge.inference import engines
 from edge.inference.release import ReleaseDelayError, parse_release_delay
-from edge.live.feed import DEFAULT_PORT, LOOPBACK, LiveOptions
+from edge.live.options import add_live_arguments, live_options
 from edge.odometry.calibration import CalibrationError
 from edge.reasoning.generation_cycle import Mode
 from edge.reasoning.prompt import InstructionError
@@ -133,20 +133,7 @@ def parser() -> argparse.ArgumentParser:
         action=argparse.BooleanOptionalAction,
         help="stand where the texts have placed the stop (default: with --recovery on)",
     )
-    p.add_argument(
-        "--live",
-        nargs="?",
-        type=int,
-        const=DEFAULT_PORT,
-        metavar="PORT",
-        help=f"serve a live view to browsers and Foxglove (default port {DEFAULT_PORT}; 0: a free one)",
-    )
-    p.add_argument(
-        "--live-address",
-        default=LOOPBACK,
-        metavar="ADDR",
-        help="where the live view listens; 0.0.0.0 admits other computers with the token (default: %(default)s)",
-    )
+    add_live_arguments(p)
     p.add_argument("--record", type=Path, metavar="FILE.mcap", help="write a flight log")
     p.add_argument("--socket", type=Path, metavar="PATH", help="socket of edge-bridge (default: the robot file's)")
     p.add_argument("--domain", type=int, metavar="N", help="DDS domain (default: the robot file's)")
@@ -167,6 +154,8 @@ def read_options(args: argparse.Namespace) -> tuple[RobotConfig, RunOptions]:
             raise ConfigError(f"--record {args.record}: there is no directory {args.record.parent}")
         check_result_target(str(args.record), "--record")
     robot = load_robot_config(args.robot, socket=args.socket, domain=args.domain)
+    if robot.ros2_publish.publish and importlib.util.find_spec("cyclonedds") is None:
+        raise ModuleNotFoundError("No module named 'cyclonedds'", name="cyclonedds")
     options = RunOptions(
         instruction=check_first_instruction(args.instruction),
         mode=Mode(args.mode),
@@ -174,24 +163,10 @@ def read_options(args: argparse.Namespace) -> tuple[RobotConfig, RunOptions]:
         release_delay=parse_release_delay(args.release_delay),
         record=args.record,
         instructions=args.instructions,
-        live=_live(args),
+        live=live_options(args),
         switches=_switches(args),
     )
     return robot, options
-
-
-def _live(args: argparse.Namespace) -> LiveOptions | None:
-    if args.live is None:
-        if args.live_address != LOOPBACK:
-            raise ConfigError(f"--live-address {args.live_address}: expected --live beside it")
-        return None
-    for module in ("aiohttp", "prometheus_client"):  # before anything starts; the view's process imports them
-        if importlib.util.find_spec(module) is None:
-            raise ModuleNotFoundError(f"No module named {module!r}", name=module)
-    try:
-        return LiveOptions(args.live_address, args.live)
-    except ValueError as error:
-        raise ConfigError(str(error)) from error
 
 
 def _switches(args: argparse.Namespace) -> SwitchOptions:

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
-from edge.live.feed import LiveError, LiveFeed, LiveOptions
+from edge.live.feed import LiveFeed
 from edge.reasoning.prompt import InstructionError, check_instruction
 from edge.run.arming import RefusedError
 from edge.run.stop_phrase import is_stop_phrase
@@ -133,16 +133,6 @@ class InstructionChannels:
         """Close every channel."""
         for channel in self._channels:
             channel.close()
-
-
-def open_live(options: LiveOptions, bridge: Path, stop: Callable[[], bool], say: Callable[[str], None]) -> LiveFeed:
-    """Start the live view and print its address. Raises RefusedError."""
-    try:
-        live = LiveFeed(options, bridge, stop, say)
-    except LiveError as error:
-        raise RefusedError(str(error)) from error
-    say(f"live view: {live.url}")
-    return live
 
 
 def open_channels(

@@ -22,15 +22,15 @@ from edge.inference.language import ContextOverflowError
 from edge.inference.scheduling import TickActivity, enter, freeze_garbage, lock_memory, schedule_for
 from edge.inference.start_guard import WARM_UP_S
 from edge.inference.warm_up import check_tick, open_proven, warm_up
-from edge.live.feed import LiveFeed
 from edge.reasoning.generation_cycle import Mode
 from edge.reasoning.prompt import InstructionError
 from edge.run.arming import POLL_S, RefusedError, StoppedEarlyError, arm, disarm
 from edge.run.assembly import Engines, Loops, RunOptions, assemble
-from edge.run.instructions import InstructionChannels, open_channels, open_live
+from edge.run.instructions import InstructionChannels, open_channels
 from edge.run.result import close_log, run_record, run_result
 from edge.run.robot_inputs import CommandTap, RobotInputs
 from edge.run.service import ServiceReporter
+from edge.run.views import Views
 from edge.safety.faults.findings import Finding
 from edge.safety.faults.table import FAULTS
 from edge.safety.watchdog import Hang, ReasoningWatch
@@ -141,7 +141,7 @@ class RunSession:
         bridge = BridgeClient(self._robot.bridge.socket)
         inputs: RobotInputs | None = None
         recorder: Recorder | None = None
-        live: LiveFeed | None = None
+        views = Views()
         channel: InstructionChannels | None = None
         result: dict[str, Any] | None = None
         end: Deadline | None = None
@@ -163,10 +163,8 @@ class RunSession:
                 if recorder.error is not None:
                     raise RefusedError(recorder.error)
             stop = functools.partial(self._stop_by, bridge)
-            if self._options.live is not None:
-                by_view = functools.partial(stop, LIVE_STOP)
-                live = open_live(self._options.live, self._robot.bridge.socket, by_view, self._print)
-            records = RecordSinks.of(recorder, live)
+            views.open(self._options.live, self._robot, functools.partial(stop, LIVE_STOP), self._print)
+            records = RecordSinks.of(recorder, views.live, views.ros2)
             loops = self._loops = assemble(
                 self._engines,
                 self._robot,
@@ -179,7 +177,8 @@ class RunSession:
                 on_tick=self._reporter.on_tick,
             )
             by_phrase, check = functools.partial(stop, STOP_PHRASE), self._engines.language.check_instruction
-            channel = open_channels(self._options, self._robot, self._bus, check, by_phrase, self._lines.append, live)
+            say, live = self._lines.append, views.live
+            channel = open_channels(self._options, self._robot, self._bus, check, by_phrase, say, live)
             loops.power.start()
             # After everything that lives as long as the process has been made.
             if (refused := lock_memory()) is not None:
@@ -214,8 +213,7 @@ class RunSession:
             bridge.close()
             if channel is not None:
                 channel.close()
-            elif live is not None:
-                live.close()
+            views.close()
             end = end or Deadline(END_S)
             if recorder is not None and (line := close_log(recorder, result, began=self._began, left_s=end.left_s())):
                 self._print(line)

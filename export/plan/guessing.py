@@ -28,20 +28,24 @@ class GuessingTime:
     """Rows of a decoding call."""
     decode: Estimate
     generation: Estimate
+    share: float
+    """Its time as a share of a generation that guesses nothing; the largest Δt shrinks by the same share."""
 
     @property
     def tokens_per_call(self) -> float:
         """New tokens of a decoding call, on average."""
         return TOKENS_PER_CALL[self.rows]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the manifest's `plan.speculation`."""
+    def to_dict(self, delay_s: float | None) -> dict[str, Any]:
+        """Return the manifest's `plan.speculation`; `delay_s`: the largest Δt without guesses, s."""
         return {
             "rows": self.rows,
             "tokens_per_call": self.tokens_per_call,
             "acceptance": ACCEPTANCE,
             "decode_ms": round(self.decode.ms, 3),
             "generation_alone_ms": round(self.generation.ms, 3),
+            "delay_s": None if delay_s is None else round(delay_s * self.share, 3),
+            "tagged": MODELLED,
         }
 
 
@@ -65,5 +69,7 @@ def guessing_time(
         longer = modelled_stage(target, config, "decode", precision, work, decode_calls=(rows, calls))
         factor = longer.whole.ms / one.whole.ms if one.whole.ms else 1.0
         decode = replace(single.whole.times(factor), tag=MODELLED)
-        ways.append(GuessingTime(rows, decode, total([*others, decode])))
+        generation = total([*others, decode])
+        share = generation.ms / total([*others, single.whole]).ms
+        ways.append(GuessingTime(rows, decode, generation, share))
     return min(ways, key=lambda way: way.decode.ms)

@@ -119,7 +119,7 @@ class Plan:
             "generation_ms": _rounded(self.generation.ms if self.generation else None),
             "generation_error": _rounded(self.generation.error if self.generation else None),
             "generation_alone_ms": _rounded(self.generation_alone.ms),
-            "speculation": self.guessing.to_dict() if self.guessing else None,
+            "speculation": self.guessing.to_dict(self.delay_s) if self.guessing else None,
             "prompt_tokens": self.work.prompt_tokens,
             "tokens": self.tokens,
             "duty": _rounded(self.duty),

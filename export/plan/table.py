@@ -46,8 +46,10 @@ def plan_lines(plan: Plan) -> list[str]:
     if (guessing := plan.guessing) is not None:
         lines.append(
             f"guessing    {_time(guessing.generation)} without control where it is exact: {guessing.rows} rows "
-            f"a call, {guessing.tokens_per_call:g} tokens, acceptance {ACCEPTANCE} (recorded texts)"
+            f"a call, {guessing.tokens_per_call:g} tokens, acceptance {ACCEPTANCE} (recorded texts; modelled)"
         )
+        if plan.delay_s is not None:
+            lines.append(f"            Δt then at most {plan.delay_s * guessing.share:.1f} s")
     if plan.average_w is not None:
         error = f" ± {plan.average_w * plan.average_w_error:.1f}" if plan.average_w_error else ""
         budget = f" of {plan.budget_w:g} W" if plan.budget_w is not None else ""

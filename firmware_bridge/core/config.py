@@ -13,7 +13,7 @@ from typing import Any, Final, get_args, get_type_hints
 
 from firmware_bridge.core.config_can import CanConfig
 from firmware_bridge.core.config_mavlink import MavlinkConfig
-from firmware_bridge.core.config_ros2 import Ros2Config
+from firmware_bridge.core.config_ros2 import Ros2Config, Ros2PublishConfig
 from firmware_bridge.core.sections import (
     OBSERVER_SUFFIX,
     OPERATOR_SUFFIX,
@@ -98,6 +98,8 @@ class RobotConfig:
     mavlink: MavlinkConfig | None = None
     can: CanConfig | None = None
     ros2: Ros2Config | None = None
+    ros2_publish: Ros2PublishConfig = field(default_factory=Ros2PublishConfig, metadata={"in_table": "ros2"})
+    """Keys of the table [ros2] that every protocol may have."""
 
     def __post_init__(self) -> None:
         require(self.protocol in LINKS, f"protocol: expected one of {', '.join(LINKS)}, found {self.protocol!r}")
@@ -105,6 +107,7 @@ class RobotConfig:
             needed, given = table in LINKS[self.protocol], getattr(self, table) is not None
             require(given or not needed, f"missing table [{table}]; protocol {self.protocol} needs it")
             require(needed or not given, f"unexpected table [{table}]; protocol {self.protocol} does not use it")
+        self.ros2_publish.check(self.dds, self.ros2, self.camera.source)
         self.camera.check_protocol(self.protocol)
         unasked = self.safety.battery_min_percent == 0
         charge_known = self.ros2 is None or self.ros2.battery != "" or unasked
@@ -153,7 +156,8 @@ def load_robot_config(path: Path | str, *, socket: Path | None = None, domain: i
         if table.get("protocol") in LINKS and table["protocol"] != "unitree" and isinstance(safety, dict):
             for key in UNITREE_SAFETY:
                 require(key not in safety, f"unknown key safety.{key}: only protocol unitree has it")
-        config: RobotConfig = _build(RobotConfig, table, "")
+        table, published = _split_ros2(table)
+        config: RobotConfig = _build(RobotConfig, table, "", ros2_publish=published)
         dds = config.dds if domain is None else replace(config.network, domain=domain)
         can = None if config.can is None else config.can.with_files_of(Path(path).absolute().parent)
         bridge = config.bridge if socket is None else replace(config.bridge, socket=socket.absolute())
@@ -162,14 +166,33 @@ def load_robot_config(path: Path | str, *, socket: Path | None = None, domain: i
         raise ConfigError(f"robot file {path}: {error}") from error
 
 
-def _build(cls: Any, table: object, prefix: str) -> Any:
-    """Build dataclass `cls` from a TOML table; every key must exist, have the declared type and be finite."""
+def _split_ros2(table: dict[str, Any]) -> tuple[dict[str, Any], Ros2PublishConfig]:
+    """Take the keys of [ros2] that every protocol may have out of a robot file's table."""
+    ros2, protocol = table.get("ros2"), table.get("protocol")
+    if not isinstance(ros2, dict):
+        return table, Ros2PublishConfig()
+    rest, published = Ros2PublishConfig.split(ros2)
+    if protocol in LINKS and "ros2" not in LINKS[protocol]:
+        for key in rest:
+            raise ConfigError(f"unknown key ros2.{key}: protocol {protocol} has only ros2.publish and ros2.publish_*")
+        table = {key: value for key, value in table.items() if key != "ros2"}
+    else:
+        table = {**table, "ros2": rest}
+    return table, _build(Ros2PublishConfig, published, "ros2.")
+
+
+def _build(cls: Any, table: object, prefix: str, **built: object) -> Any:
+    """Build dataclass `cls` from a TOML table; every key must exist, have the declared type and be finite.
+
+    `built`: fields that are no table of their own.
+    """
     if not isinstance(table, dict):
         raise ConfigError(f"[{prefix[:-1]}]: expected a table, found {table!r}")
-    declared, hints = {each.name: each for each in fields(cls)}, get_type_hints(cls)
+    declared = {each.name: each for each in fields(cls) if "in_table" not in each.metadata}
+    hints = get_type_hints(cls)
     for key in table:
         require(key in declared, f"unknown key {prefix}{key}; expected {', '.join(declared)}")
-    values: dict[str, Any] = {}
+    values: dict[str, Any] = dict(built)
     for key, each in declared.items():
         if key not in table:
             optional = each.default is not MISSING or each.default_factory is not MISSING

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
-from typing import Final
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar, Final
 
-from firmware_bridge.core.sections import Section, require, within_range
+from firmware_bridge.core.sections import ConfigError, DdsConfig, Section, require, within_range
 
+PUBLISHED: Final = (
+    "odom", "tf", "camera/image/compressed", "camera/camera_info", "plan", "diagnostics", "reasoning", "delta_t",
+)  # fmt: skip
+"""Topics that a runner publishes, relative to `publish_namespace`."""
+_OF_DDS: Final = -1
 LONGEST_BASE_TIMEOUT_MS: Final = 2000
 """Longest own timeout of a base that may drive without supervision, ms (our choice: 1.6 m at 0.8 m/s)."""
 MAX_NAME_CHARS: Final = 200
@@ -49,8 +55,7 @@ class Ros2Config(Section):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        legal = len(self.namespace) <= MAX_NAME_CHARS and _NAMESPACE.fullmatch(self.namespace)
-        require(bool(legal), f'ros2.namespace: expected "/" or a name such as "/robot1", found {self.namespace!r}')
+        _check_namespace("ros2.namespace", self.namespace)
         frame_ok = len(self.command_frame) <= MAX_NAME_CHARS and _NAME.fullmatch(self.command_frame)
         require(
             bool(frame_ok), f'ros2.command_frame: expected a frame such as "base_link", found {self.command_frame!r}'
@@ -81,6 +86,75 @@ class Ros2Config(Section):
     def topic(self, name: str) -> str:
         """Return the DDS name of a topic of this table: `rt` and the full ROS name."""
         return dds_topic(name, self.namespace)
+
+
+@dataclass(frozen=True)
+class Ros2PublishConfig(Section):
+    """What a runner publishes as a ROS 2 node, for a robot of any protocol: keys of [ros2] in the robot file.
+
+    `publish_domain` (-1) and `publish_interface` ("") are by default those of [dds].
+    """
+
+    table_name: ClassVar[str] = "ros2"
+
+    publish: bool = False
+    publish_namespace: str = "/"
+    publish_domain: int = within_range(_OF_DDS, 232, _OF_DDS)
+    publish_interface: str = ""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_namespace("ros2.publish_namespace", self.publish_namespace)
+
+    @staticmethod
+    def split(table: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Return the keys of a table [ros2] that are not of this class, and those that are."""
+        own = {each.name for each in fields(Ros2PublishConfig)}
+        rest = {key: value for key, value in table.items() if key not in own}
+        return rest, {key: value for key, value in table.items() if key in own}
+
+    def topic(self, name: str) -> str:
+        """Return the DDS name of one of PUBLISHED."""
+        return dds_topic(name, self.publish_namespace)
+
+    def network(self, dds: DdsConfig | None) -> DdsConfig:
+        """Return the network on which to publish. Raises ConfigError."""
+        if dds is None:
+            require(
+                bool(self.publish_interface),
+                'missing key ros2.publish_interface, such as "wlan0": this protocol has no [dds]',
+            )
+            dds = DdsConfig(0, self.publish_interface)
+        if self.publish_interface and self.publish_interface != dds.interface:
+            try:
+                dds = DdsConfig(dds.domain, self.publish_interface, participants=dds.participants)
+            except ConfigError:
+                found = self.publish_interface
+                raise ConfigError(f"ros2.publish_interface: expected a name or an address, found {found!r}") from None
+        return dds if self.publish_domain == _OF_DDS else replace(dds, domain=self.publish_domain)
+
+    def check(self, dds: DdsConfig | None, base: Ros2Config | None, camera: str) -> None:
+        """Check what other tables decide: a network, and no topic that base, bridge or runner use already.
+
+        `camera`: camera.source. Raises ConfigError.
+        """
+        if not self.publish:
+            return
+        self.network(dds)
+        if base is not None:
+            names = (base.odometry, base.command, base.imu, base.battery, base.instruction)
+            used = {base.topic(name) for name in names if name} | {dds_topic(camera.partition(":")[2] or "/")}
+            own = self.publish_namespace != base.namespace and used.isdisjoint(map(self.topic, PUBLISHED))
+            require(
+                own,
+                'ros2.publish_namespace: expected one that the base does not use, such as "/tic_vla", found'
+                f" {self.publish_namespace!r}: the bridge stops on a second publisher of a topic that it reads",
+            )
+
+
+def _check_namespace(where: str, name: str) -> None:
+    legal = len(name) <= MAX_NAME_CHARS and _NAMESPACE.fullmatch(name)
+    require(bool(legal), f'{where}: expected "/" or a name such as "/robot1", found {name!r}')
 
 
 def check_topic_name(where: str, name: str) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from edge.core.cli import check_result_directory, check_result_target
+from edge.live.options import add_live_arguments
 from edge.state.switches import Decoding, RecoverySwitch, Speculation
 from firmware_bridge.system.terminal import CommandParser
 from sim_hil.benchmark.conditions.conditions import (
@@ -29,7 +30,7 @@ from sim_hil.benchmark.conditions.conditions import (
 from sim_hil.benchmark.conditions.latency import LatencyProfile, parse_latency
 from sim_hil.benchmark.policies.external_protocol import Address, ExternalError
 from sim_hil.benchmark.suite.episode import Episode, load_suite, suite_names
-from sim_hil.benchmark.workers.task import VIDEO_CHOICES
+from sim_hil.benchmark.workers.task import FLIGHT_CHOICES, VIDEO_CHOICES
 from sim_hil.realtime.robots import GO2, ROBOTS
 
 REFUSALS: Final = (ExternalError, ValueError, OSError)
@@ -122,9 +123,11 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--resume", action="store_true", help="continue the interrupted run in --out")
     p.add_argument("--video", choices=VIDEO_CHOICES, default="none", help="episodes to record on video (default none)")
     p.add_argument(
-        "--flight-logs", choices=VIDEO_CHOICES, help="episodes of an artifact policy whose flight log is kept and "
-        "explained in the report: all, failed (or collided), none (default: failed with --out; lockstep only)",
+        "--flight-logs", choices=FLIGHT_CHOICES, help="episodes of an artifact policy whose flight log is kept and "
+        "explained in the report: all, failed (or collided), none; causes keeps the causes of failures alone (default: "
+        "failed with --out, causes for dynanav-fresh; lockstep only)",
     )  # fmt: skip
+    add_live_arguments(p)
     p.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     return p
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import shutil
+import socket
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ from edge.core.cli import (
     stop_signals,
     write_result,
 )
+from edge.live.options import LiveOptions, live_options
 from firmware_bridge.core.config import ConfigError
 from firmware_bridge.system.terminal import one_line
 from sim_hil.benchmark.arguments import SUBCOMMANDS, check, parser
@@ -35,6 +38,7 @@ from sim_hil.benchmark.results.report import write_report
 from sim_hil.benchmark.results.store import ResultStore, StoreError, read_results
 from sim_hil.benchmark.runs import RESULT, BenchRun, execute
 from sim_hil.benchmark.suite.episode import SuiteError, load_suite
+from sim_hil.benchmark.suite.strata import is_fresh
 from sim_hil.benchmark.workers.cluster import ClusterError, ClusterJobs
 from sim_hil.benchmark.workers.jobs import Backend, LocalJobs, RefusedRunError
 from sim_hil.benchmark.workers.progress import BenchProgress
@@ -91,13 +95,12 @@ def _run(args: argparse.Namespace) -> int:
             raise ConditionsError(f"--episodes: expected an episode of the {robot.hil_robot}, found none")
     episodes = list(reworded(episodes, conditions, lambda: load_suite(args.suite)))
     run = BenchRun.plan(args.suite, episodes, conditions)
-    with _output_directory(args.out) as folder, stop_signals() as stop:
+    with _output_directory(args.out) as folder, _live_view(args, conditions.clock) as live, stop_signals() as stop:
         done = len(read_results(folder)) if args.resume else 0
-        with BenchProgress(len(run.episodes), done) as progress:
+        with BenchProgress(len(run.episodes), done, blind=is_fresh(args.suite)) as progress:
             execution = execute(
                 run, folder, _backend(args), resume=args.resume, video=args.video,
-                flights=args.flight_logs or ("none" if args.out is None else "failed"), stopped=lambda: bool(stop),
-                watcher=progress.watcher,
+                flights=_flight_logs(args), stopped=lambda: bool(stop), live=live, watcher=progress.watcher,
             )  # fmt: skip
         store, finished, result = execution.store, execution.finished, execution.result
         result["skipped"] = skipped
@@ -109,6 +112,12 @@ def _run(args: argparse.Namespace) -> int:
     if not store.results:
         return _report_problem("no episode has a result: nothing was measured", EXIT_CHECK_FAILED)
     return EXIT_CHECK_FAILED if store.failed else EXIT_DONE
+
+
+def _flight_logs(args: argparse.Namespace) -> str:
+    if args.flight_logs is not None:
+        return str(args.flight_logs)
+    return "none" if args.out is None else "causes" if is_fresh(args.suite) else "failed"
 
 
 def _backend(args: argparse.Namespace) -> Backend:
@@ -129,6 +138,29 @@ def _output_directory(out: Path | None) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
+@contextmanager
+def _live_view(args: argparse.Namespace, clock: str) -> Iterator[LiveOptions | None]:
+    """Print the one address of all episodes' live views; their runners share its port and token.
+
+    Raises ConfigError or LiveError.
+    """
+    live = live_options(args)
+    if live is None:
+        yield None
+        return
+    if clock != "realtime":
+        raise ConfigError("--live: expected --clock realtime, whose episodes a runner drives")
+    if live.port == 0:
+        with socket.socket() as probe:  # every episode listens at the same port
+            probe.bind((live.address, 0))
+            live = replace(live, port=probe.getsockname()[1])
+    with tempfile.TemporaryDirectory(prefix="edge-bench-live-") as folder:
+        if live.token_file is None:
+            live = replace(live, token_file=Path(folder) / "token")
+        _report_problem(f"live view, while an episode drives: {live.url(live.port, live.token())}", EXIT_DONE)
+        yield live
+
+
 def _write_outputs(args: argparse.Namespace, store: ResultStore, result: dict[str, Any]) -> None:
     write_result(args.json, result)
     if args.out is not None:
@@ -145,7 +177,8 @@ def summary_lines(result: dict[str, Any]) -> str:
     """Format a run's summary as a table for the terminal."""
     summary = result["summary"]
     rows = [("all", summary)]
-    rows += [(key, means) for group in ("by_scene", "by_crowd", "by_robot") for key, means in summary[group].items()]
+    groups = [members for group, members in summary.items() if group.startswith("by_")]
+    rows += [(key, means) for members in groups for key, means in members.items()]
     lines = [f"{'':<14}{'episodes':>9}{'SR %':>8}{'SPL %':>8}{'NE m':>8}{'CR %':>8}"]
     for name, means in rows:
         cells = "".join(

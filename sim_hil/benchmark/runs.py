@@ -12,17 +12,21 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 from edge.core.cli import write_whole
 from edge.core.stats import percentiles
+from edge.live.options import LiveOptions
 from firmware_bridge.system.input_file import read_json
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.conditions.rewording import reworded
 from sim_hil.benchmark.policies.select import check_artifacts, open_policy
+from sim_hil.benchmark.results.causes import cause_counts, read_causes
 from sim_hil.benchmark.results.record import EpisodeResult, read_log
 from sim_hil.benchmark.results.store import CONFIG, EPISODES, ResultStore
 from sim_hil.benchmark.results.summary import summarise
 from sim_hil.benchmark.suite.episode import Episode, load_suite
+from sim_hil.benchmark.suite.strata import is_fresh
 from sim_hil.benchmark.workers.code_version import code_sha256
 from sim_hil.benchmark.workers.jobs import Backend, LocalJobs, RunWatcher, run_all
 from sim_hil.benchmark.workers.run_episode import RUNNERS
@@ -86,12 +90,20 @@ class BenchRun:
             "versions": versions(),
         }
 
-    def tasks(self, folder: Path, video: str = "none", flights: str = "none") -> list[EpisodeTask]:
-        """Return one task per episode, the longest first, for an even load. Raises ConditionsError."""
+    def tasks(
+        self, folder: Path, video: str = "none", flights: str = "none", live: LiveOptions | None = None
+    ) -> list[EpisodeTask]:
+        """Return one task per episode in the order of their start. Raises ConditionsError.
+
+        The longest come first, for an even load; those of the fresh suite in an order without regard to their kind, so
+        that the rates of an unfinished run are of a fair sample.
+        """
         tasks = [
-            EpisodeTask(episode, self.conditions, folder, video, flights, self.manifest_sha256)
+            EpisodeTask(episode, self.conditions, folder, video, flights, self.manifest_sha256, live=live)
             for episode in self.episodes
         ]
+        if is_fresh(self.suite):
+            return sorted(tasks, key=lambda task: crc32(task.episode.id.encode()))
         # Simulation time grows with the time limit and the crowd.
         return sorted(tasks, key=lambda task: -task.episode.timeout_s * (20 + task.episode.people))
 
@@ -119,6 +131,7 @@ def bench_result(run: BenchRun, store: ResultStore, *, finished: bool, started_n
             "failed_runs": len(store.failed),
             "finished": finished,
         },
+        "causes": cause_counts(results, read_causes(store.directory, results)),
         "episodes": [result.as_json() for result in results],
         "failed_runs": [asdict(failed) for failed in store.failed],
         "latency": latency_result(store.directory, run.conditions, results),
@@ -177,6 +190,7 @@ def execute(
     resume: bool,
     video: str = "none",
     flights: str = "none",
+    live: LiveOptions | None = None,
     stopped: Callable[[], bool],
     watcher: RunWatcher | None = None,
 ) -> Execution:
@@ -186,7 +200,7 @@ def execute(
     try:
         store = (ResultStore.resume if resume else ResultStore.create)(directory, run.config())
         before = len(store.results)
-        tasks = run.tasks(store.directory, video, flights)
+        tasks = run.tasks(store.directory, video, flights, live)
         finished = run_all(tasks, backend, store, stopped=stopped, watcher=watcher)
     finally:
         backend.close()

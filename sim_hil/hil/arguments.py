@@ -14,13 +14,15 @@ from pathlib import Path
 from typing import Final
 
 from edge.core.cli import check_result_target
+from edge.live.options import add_live_arguments
 from firmware_bridge.core.config import ConfigError
 from firmware_bridge.system.terminal import CommandParser
 from sim_hil.hil.display import check_display
 from sim_hil.hil.trace import POSE_HZ
+from sim_hil.layouts.scenes import open_scene
 from sim_hil.protocols.registry import FLAGS, check_combination, check_flags, protocols, robots
 from sim_hil.robots.odometry_noise import LEVELS
-from sim_hil.scene.scene import Scene, SceneError, load_scene, scene_names
+from sim_hil.scene.scene import Scene, SceneError, scene_names
 
 MAX_PEOPLE: Final = 500
 MAX_POSE_HZ: Final = 500
@@ -35,6 +37,7 @@ EPILOG: Final = """examples:
   edge-hil --robot carter --scene office --protocol mavlink --link udp:0.0.0.0:14580,camera=8091,system=2
   edge-hil --robot carter --scene office --protocol ros2 --domain 5 --interface lo
   edge-hil --robot go2 --scene corridor --protocol unitree --duration 60 --trace run.jsonl --json -
+  edge-hil --robot go2 --scene corridor --protocol unitree --people 4 --live
   edge-hil --robot go2 --scene corridor --protocol unitree --odometry-noise severe --seed 7 --faults faults.sock
 --link of can: INTERFACE:CHANNEL[,camera=PORT][,FAULT=NUMBER...]
   INTERFACE  serial (a serial line; a path that does not exist becomes the client's end of a pty),
@@ -119,6 +122,7 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--pose-hz", type=int, default=POSE_HZ, metavar="N", help=f"poses a second in the trace (default {POSE_HZ})"
     )
+    add_live_arguments(parser)
     parser.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
     parser.add_argument("--gui", action="store_true", help="show the physics in a window")
     return parser
@@ -146,7 +150,7 @@ def check(args: argparse.Namespace) -> Scene:
 
 
 def _scene(args: argparse.Namespace) -> Scene:
-    scene = load_scene(args.scene)
+    scene = open_scene(args.scene)
     if args.start is None:
         return scene
     (x_m, y_m, _), (x0, y0), (x1, y1) = args.start, scene.floor_min_m, scene.floor_max_m

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from dataclasses import replace
 from typing import Final
 
 import pybullet
@@ -18,6 +19,8 @@ from edge.core.cli import (
     stop_signals,
     write_result,
 )
+from edge.live.feed import LiveFeed
+from edge.live.options import LiveOptions, live_options
 from firmware_bridge.core.config import ConfigError
 from firmware_bridge.core.robot_state import DdsError
 from firmware_bridge.dds.bus import DDS_ERRORS
@@ -25,6 +28,7 @@ from firmware_bridge.system.terminal import one_line
 from sim_hil.hil.arguments import check, parser
 from sim_hil.hil.loop import HilLoop
 from sim_hil.hil.trace import TraceWriter
+from sim_hil.hil.view import HilView
 from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions
 from sim_hil.protocols.registry import open_front_end
 from sim_hil.scene.scene import Scene, SceneError
@@ -41,7 +45,7 @@ def main(argv: list[str] | None = None) -> int:
     args = parser().parse_args(argv)
     with stop_signals() as stop:
         try:
-            loop, address = _open(args, check(args))
+            loop, address = _open(args, check(args), live_options(args))
         except (ConfigError, SceneError, DdsError, FrontEndError, ValueError, OSError) as error:
             return _report_error(error, EXIT_BAD_INPUT)
         try:
@@ -56,8 +60,8 @@ def main(argv: list[str] | None = None) -> int:
         return code or written
 
 
-def _open(args: argparse.Namespace, scene: Scene) -> tuple[HilLoop, str]:
-    """Open simulation and front end; return the loop and the robot's address as text."""
+def _open(args: argparse.Namespace, scene: Scene, live: LiveOptions | None) -> tuple[HilLoop, str]:
+    """Open simulation, view and front end; return the loop and the robot's address as text."""
     options = FrontEndOptions(
         robot=args.robot,
         scene_source=args.scene,
@@ -72,20 +76,27 @@ def _open(args: argparse.Namespace, scene: Scene) -> tuple[HilLoop, str]:
         interface="lo" if args.interface is None else args.interface,
     )
     simulation = Simulation(scene, people=args.people, seed=args.seed, gui=args.gui, robot=args.robot)
+    feed: LiveFeed | None = None
     try:
+        if live is not None:
+            feed = LiveFeed(live, None, lambda: False, _print)
+            _print(f"live view: {feed.url}")
+            options = replace(options, view_fd=feed.picture_fd)
         front_end = open_front_end(args.protocol, simulation, options)
     except BaseException:
+        if feed is not None:
+            feed.close()
         simulation.close()
         raise
-    return HilLoop(simulation, front_end, options, pose_hz=args.pose_hz), front_end.where()
+    view = None if feed is None else HilView(feed)
+    return HilLoop(simulation, front_end, options, pose_hz=args.pose_hz, view=view), front_end.where()
 
 
 def _run(loop: HilLoop, trace: TraceWriter | None, stop: list[int], args: argparse.Namespace, address: str) -> int:
     try:
         try:
             if loop.start(trace, stop):
-                sys.stderr.write(f"edge-hil: ready, {address}\n")
-                sys.stderr.flush()
+                _print(f"ready, {address}")
                 loop.run(stop, args.duration)
         finally:
             loop.close()
@@ -108,8 +119,13 @@ def _write_results(loop: HilLoop, trace: TraceWriter | None, args: argparse.Name
 
 
 def _report_error(message: object, code: int) -> int:
-    sys.stderr.write(f"edge-hil: {one_line(message)}\n")
+    _print(one_line(message))
     return code
+
+
+def _print(line: str) -> None:
+    sys.stderr.write(f"edge-hil: {line}\n")
+    sys.stderr.flush()
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from sim_hil.hil.trace import POSE_HZ, TraceWriter
+from sim_hil.hil.view import RATE_HZ, HilView
 from sim_hil.protocols.front_end import FrontEnd, FrontEndOptions
 from sim_hil.simulation.physics import Simulation
 
@@ -26,10 +27,17 @@ class HilLoop:
     """Real-time loop of one simulated robot and one front end."""
 
     def __init__(
-        self, simulation: Simulation, front_end: FrontEnd, options: FrontEndOptions, *, pose_hz: int = POSE_HZ
+        self,
+        simulation: Simulation,
+        front_end: FrontEnd,
+        options: FrontEndOptions,
+        *,
+        pose_hz: int = POSE_HZ,
+        view: HilView | None = None,
     ) -> None:
-        """Take ownership of `simulation` and `front_end`, which `close` closes; `pose_hz`: trace poses a second."""
+        """Take ownership of the first two and `view`, which `close` closes; `pose_hz`: trace poses a second."""
         self._pose_hz = pose_hz
+        self._view = view
         self._simulation = simulation
         self._front_end = front_end
         self._options = options
@@ -47,6 +55,8 @@ class HilLoop:
         Raises RuntimeError or OSError.
         """
         self._trace = trace
+        if self._view is not None:
+            self._view.start(self._options)
         scene = self._options.scene
         solids = [(wall.label, "wall", wall.box) for wall in scene.walls]
         solids += [(thing.label, thing.kind, thing.box) for thing in scene.objects]
@@ -87,8 +97,10 @@ class HilLoop:
             self._duration_s = (time.monotonic_ns() - begin_ns) / 1e9
 
     def close(self) -> None:
-        """Close the front end and the simulation."""
+        """Close the front end, the view and the simulation."""
         self._front_end.close()
+        if self._view is not None:
+            self._view.close()
         self._simulation.close()
 
     def _serve(self) -> None:
@@ -115,6 +127,8 @@ class HilLoop:
             self._note_command()
         if step * self._pose_hz // STEPS_PER_S != (step - 1) * self._pose_hz // STEPS_PER_S:
             self._note_pose()
+        if self._view is not None and step % (STEPS_PER_S // RATE_HZ) == 0:
+            self._view.show(self._simulation, self._front_end)
         if step % (STEPS_PER_S // PEOPLE_HZ) == 0:
             self._note("people", poses=[[float(v) for v in row] for row in self._simulation.people()])
 

@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_hil.protocols.fault_socket import FaultEndpoint
 from sim_hil.protocols.render_process import RenderProcess
 
 Vec3 = tuple[float, float, float]
@@ -68,11 +69,16 @@ class CameraFrontEnd:
     """Front end whose camera, if it has one, renders in a process of its own."""
 
     _camera: RenderProcess | None = None
+    _faults: FaultEndpoint | None = None
 
     def start(self, render_state: NDArray[np.float64], stop: Sequence[int]) -> bool:
         """Wait for the camera. Raises CameraProcessError."""
         self.show(render_state)
         return self._camera is None or self._camera.wait_ready(stop)
+
+    def injected(self) -> Sequence[str]:
+        """Return the names of the faults that are switched on."""
+        return () if self._faults is None else self._faults.injected()
 
     def show(self, render_state: NDArray[np.float64]) -> None:
         """Pass the state to render to the camera process."""

@@ -20,11 +20,11 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final, TextIO
 
 from firmware_bridge.system.terminal import CommandParser
+from sim_hil.layouts.scenes import open_scene
 from sim_hil.processes.child_process import Message, input_is_open, take_standard_output, write_message
 from sim_hil.protocols.front_end import FrontEndOptions
-from sim_hil.protocols.render_process import RenderProcess, encode_jpeg
+from sim_hil.protocols.render_process import PictureView, RenderProcess, encode_jpeg
 from sim_hil.protocols.snapshot import SnapshotReader, TornSnapshotError
-from sim_hil.scene.scene import load_scene
 from sim_hil.simulation.camera import CameraWorld
 from sim_hil.simulation.sensor_noise import SensorNoise
 
@@ -177,12 +177,19 @@ class CameraStream(RenderProcess):
 
 
 def _render_while_parent_lives(
-    world: CameraWorld, poses: SnapshotReader, shutter: Shutter, size: tuple[int, int], noise: SensorNoise, pipe: TextIO
+    world: CameraWorld,
+    poses: SnapshotReader,
+    shutter: Shutter,
+    size: tuple[int, int],
+    noise: SensorNoise,
+    pipe: TextIO,
+    view: PictureView,
 ) -> None:
     period_ns, next_ns = round(1e9 / RATE_HZ), time.monotonic_ns()
     while input_is_open():
         left_s = (next_ns - time.monotonic_ns()) / 1e9
-        if not shutter.wanted or left_s > 0:
+        wanted = shutter.wanted
+        if not (wanted or view.is_due) or left_s > 0:
             time.sleep(min(_IDLE_S, max(left_s, 0.002)))
             continue
         next_ns = max(next_ns + period_ns, time.monotonic_ns())
@@ -194,8 +201,11 @@ def _render_while_parent_lives(
             sys.stderr.write(f"edge-hil camera: image skipped: {error}\n")
             continue
         if state is not None:
-            shutter.show(captured_ns, encode_jpeg(noise.add(world.render(state, *size))))
-            write_message(pipe, {"event": "picture"})
+            jpeg = encode_jpeg(noise.add(world.render(state, *size)))
+            view.show(jpeg)
+            if wanted:
+                shutter.show(captured_ns, jpeg)
+                write_message(pipe, {"event": "picture"})
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -205,20 +215,21 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--robot", required=True)
     for name in ("people", "seed", "width", "height", "listen-fd", "pose-fd"):
         parser.add_argument(f"--{name}", type=int, required=True)
+    parser.add_argument("--view-fd", type=int)
     args = parser.parse_args(argv)
     # Ctrl-C reaches the whole process group, but the parent decides when the camera ends.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     pipe, shutter, size = take_standard_output(), Shutter(), (args.width, args.height)
     server = CameraServer(socket.socket(fileno=args.listen_fd), shutter)
-    world = CameraWorld(load_scene(args.scene), people=args.people, seed=args.seed, robot=args.robot)
+    world = CameraWorld(open_scene(args.scene), people=args.people, seed=args.seed, robot=args.robot)
     poses = SnapshotReader(args.pose_fd, world.state_size)
     noise = SensorNoise(args.width, args.height, args.seed)
     threading.Thread(target=server.serve_forever, name="camera-http", daemon=True).start()
     # BrokenPipeError: the parent died between two checks of stdin.
     with contextlib.closing(world), contextlib.closing(poses), contextlib.suppress(BrokenPipeError):
         write_message(pipe, {"event": "ready"})
-        _render_while_parent_lives(world, poses, shutter, size, noise, pipe)
+        _render_while_parent_lives(world, poses, shutter, size, noise, pipe, PictureView(args.view_fd))
     return 0
 
 

@@ -37,6 +37,10 @@ class FaultEndpoint:
             os.umask(umask)
         self._socket.setblocking(False)
 
+    def injected(self) -> tuple[str, ...]:
+        """Return the names of the faults that are switched on."""
+        return ()
+
     def _received(self) -> Iterator[tuple[bytes, str]]:
         """Yield the requests that have arrived and their senders, a limited number per call."""
         for _ in range(_MAX_A_POLL):
@@ -71,6 +75,13 @@ class PlanFaults(FaultEndpoint, Generic[P]):
         self._switches = switches
         self.active: set[str] = set()
         """Switches that are on."""
+
+    def injected(self) -> tuple[str, ...]:
+        """Return the switches that are on and the fields that differ from the initial faults."""
+        changed = (
+            name for name in plan_fields(type(self.plan)) if getattr(self.plan, name) != getattr(self._begin, name)
+        )
+        return (*sorted(self.active), *changed)
 
     def poll(self) -> None:
         """Handle the requests that have arrived, without waiting."""

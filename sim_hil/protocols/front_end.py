@@ -41,6 +41,8 @@ class FrontEndOptions:
     link: str | None
     domain: int
     interface: str
+    view_fd: int | None = None
+    """Descriptor for the camera's pictures of a live view; None: there is no view."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,10 @@ class FrontEnd(Protocol):
 
     def publish(self, step: int, stamp_s: float) -> None:
         """Send the messages due after physics step number `step`, at `stamp_s` of the robot's own clock."""
+        ...
+
+    def injected(self) -> Sequence[str]:
+        """Return the names of the faults that are switched on."""
         ...
 
     def show(self, render_state: NDArray[np.float64]) -> None:

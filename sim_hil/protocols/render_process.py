@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import socket
 import sys
 import time
 from collections.abc import Sequence
@@ -11,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.live.wire import PICTURE, Datagram
 from sim_hil.processes.child_process import ChildProcess, Message, parse_message
 from sim_hil.protocols.front_end import FrontEndOptions
 from sim_hil.protocols.snapshot import SnapshotWriter
@@ -18,6 +21,7 @@ from sim_hil.protocols.snapshot import SnapshotWriter
 _START_TIMEOUT_S: Final = 60.0
 _END_TIMEOUT_S: Final = 3.0
 _POLL_S: Final = 0.02
+_IDLE_PICTURE_NS: Final = 500_000_000
 JPEG_QUALITY: Final = 85
 
 
@@ -43,6 +47,9 @@ class RenderProcess:
         width, height = options.camera_size or (0, 0)
         command = [sys.executable, "-m", module, "--scene", options.scene_source, "--people", str(options.people)]
         command += ["--seed", str(options.seed), "--width", str(width), "--height", str(height), *more]
+        if options.view_fd is not None:
+            command += ["--view-fd", str(options.view_fd)]
+            pass_fds = (*pass_fds, options.view_fd)
         self._pose = SnapshotWriter(state_length)
         try:
             pose_fd = self._pose.fd
@@ -92,6 +99,28 @@ class RenderProcess:
         self._closed = True
         self._child.close(_END_TIMEOUT_S)
         self._pose.close()
+
+
+class PictureView:
+    """The camera process's end of a live view: shows what the camera sends, and little where nobody asks for it."""
+
+    def __init__(self, fd: int | None) -> None:
+        """`fd`: descriptor of `FrontEndOptions.view_fd`; None: no view."""
+        self._socket = None if fd is None else socket.socket(fileno=fd)
+        self._shown_ns = 0
+
+    @property
+    def is_due(self) -> bool:
+        """Whether the view has had no picture for a while and wants one that nobody asked for."""
+        return self._socket is not None and time.monotonic_ns() - self._shown_ns > _IDLE_PICTURE_NS
+
+    def show(self, jpeg: bytes) -> None:
+        """Show a picture; dropped when the view is busy or has ended. Never waits."""
+        if self._socket is None:
+            return
+        self._shown_ns = time.monotonic_ns()
+        with contextlib.suppress(OSError):
+            self._socket.send(Datagram(PICTURE, jpeg, "/camera", self._shown_ns).encode(), socket.MSG_DONTWAIT)
 
 
 def encode_jpeg(rgb: NDArray[np.uint8]) -> bytes:

@@ -13,6 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Literal
 
+from edge.live.options import LiveOptions
 from edge.state.switches import SwitchOptions
 from firmware_bridge.core.config import BRIDGE_PRIORITY
 from sim_hil.protocols.fault_socket import FaultClient
@@ -59,6 +60,8 @@ class StackOptions:
     """Whether the runner accepts further instructions while driving."""
     switches: SwitchOptions = field(default_factory=SwitchOptions)
     """Decoding rules and recoveries requested from the runner."""
+    live: LiveOptions | None = None
+    """Where the runner's live view listens; None: there is none."""
     pose_hz: int | None = None
     """Poses a second in the trace; None: edge-hil's default."""
 
@@ -173,6 +176,7 @@ class Stack:
         ]
         if options.instructions:
             command += ["--instructions", str(self.instructions)]
+        command += options.live.arguments() if options.live else []
         asked = options.switches
         command += ["--decoding", asked.decoding.value] if asked.decoding else []
         command += ["--recovery", asked.recovery.value] if asked.recovery else []

@@ -7,7 +7,7 @@ free cells with 16 neighbours (error at most 2.8 % before smoothing). A path is 
 from __future__ import annotations
 
 import itertools
-from functools import cached_property
+from functools import cached_property, lru_cache
 from math import ceil, cos, floor, hypot, sin
 
 import numpy as np
@@ -172,11 +172,13 @@ class NavGrid:
         u = (points_m[..., 0] - self.origin_m[0]) / self.resolution_m - 0.5
         v = (points_m[..., 1] - self.origin_m[1]) / self.resolution_m - 0.5
         outside = (u < -0.5) | (v < -0.5) | (u > self.shape[1] - 0.5) | (v > self.shape[0] - 0.5)
-        column = np.clip(u.astype(np.int64), 0, self.shape[1] - 2)
-        row = np.clip(v.astype(np.int64), 0, self.shape[0] - 2)
-        a, b = np.clip(u - column, 0.0, 1.0), np.clip(v - row, 0.0, 1.0)
-        low = grid[row, column] * (1 - a) + grid[row, column + 1] * a
-        high = grid[row + 1, column] * (1 - a) + grid[row + 1, column + 1] * a
+        # Called with few points, where numpy.clip takes longer than the arithmetic.
+        column = np.minimum(np.maximum(u.astype(np.int64), 0), self.shape[1] - 2)
+        row = np.minimum(np.maximum(v.astype(np.int64), 0), self.shape[0] - 2)
+        a, b = np.minimum(np.maximum(u - column, 0.0), 1.0), np.minimum(np.maximum(v - row, 0.0), 1.0)
+        rest, right, below = 1 - a, column + 1, row + 1
+        low = grid[row, column] * rest + grid[row, right] * a
+        high = grid[below, column] * rest + grid[below, right] * a
         return np.asarray(np.where(outside, -1.0, low * (1 - b) + high * b))
 
     def _tree(self, goal: Vec2) -> tuple[Array, NDArray[np.int32]] | None:
@@ -247,9 +249,9 @@ class NavGrid:
     def sees(self, a: Vec2, b: Vec2) -> bool:
         """Return whether the straight line between two points is free."""
         count = max(2, ceil(hypot(b[0] - a[0], b[1] - a[1]) / (0.5 * self.resolution_m)) + 1)
-        share = np.linspace(0.0, 1.0, count)[:, None]
-        points = np.array(a) * (1 - share) + np.array(b) * share
-        return bool(np.all(self.clearances_at(points) >= self.required_m - _HAIR_M))
+        share, rest = _shares(count)
+        points = np.array(a) * rest + np.array(b) * share
+        return bool((self.clearances_at(points) >= self.required_m - _HAIR_M).all())
 
     def _pulled(self, points: list[Vec2]) -> list[Vec2]:
         """Shorten a chain of cells like a taut string: skip points, then move every corner inwards."""
@@ -300,6 +302,13 @@ class NavGrid:
             else:
                 high = middle
         return best
+
+
+@lru_cache(maxsize=1024)
+def _shares(count: int) -> tuple[Array, Array]:
+    """Return the shares [count, 1] of a line's end and of its start at points from the start to the end."""
+    share = np.linspace(0.0, 1.0, count)[:, None]
+    return share, 1 - share
 
 
 def links(

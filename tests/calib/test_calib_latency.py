@@ -11,7 +11,7 @@ import pytest
 
 from calib.cli import main
 from calib.latency import LEAST
-from calib.latency_load import WARM, Measured, MeasureError, measure
+from calib.latency_load import WARM, Decoding, Measured, MeasureError, measure
 from edge.artifacts.manifest import load_artifacts
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE
 from edge.flightlog.recorder import Recorder
@@ -128,12 +128,25 @@ def test_generations_run_beside_ticks_and_the_first_generations_are_left_out(art
     assert all(0 <= anchor_s < total_s < 60 for total_s, anchor_s in found.times_s)
     # Ticks went on all the while: ten a second, were it not for a busy machine.
     assert found.ticks >= len(found.times_s) + WARM
+    calls = LatencyProfile("n", "s", (1.0,), call_s=found.call_s, rest_s=(0.5,))
+    decoded_s = [calls.decode_s(decoding.call_tokens[1:]) for decoding in found.decoding]
+    assert sum(decoded_s) == pytest.approx(sum(decoding.after_first_s for decoding in found.decoding))
 
 
 @pytest.mark.slow
 def test_a_measurement_ends_after_its_time_with_what_there_is(artifacts_dir: Path) -> None:
     found = measured(artifacts_dir, mode=Mode.NO_REASONING, generations=10_000, seconds=0.5)
     assert len(found.times_s) < 10_000
+
+
+def test_durations_of_calls_have_the_proportions_alone_and_the_sum_beside_control() -> None:
+    decoding = (Decoding(0.5, (1, 2, 4)), Decoding(0.4, (2, 4)))
+    found = Measured(((1.0, 0.0),) * 2, 9, 0, 0, decoding, {2: 1.0, 4: 2.0})
+    assert found.call_s == ((2, pytest.approx(0.18)), (4, pytest.approx(0.36)))
+
+
+def test_without_calls_after_the_first_token_no_duration_of_a_call_is_known() -> None:
+    assert Measured(((1.0, 0.0),), 9, 0, 0, (Decoding(0.0, (1,)),), {2: 1.0}).call_s == ()
 
 
 def test_a_control_thread_that_dies_ends_the_measurement(artifacts_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:

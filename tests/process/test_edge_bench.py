@@ -122,6 +122,7 @@ def test_without_an_output_directory_the_result_is_only_printed(
         (("--suite", "nowhere"), 2, "unknown suite 'nowhere'"),
         (("--episodes", "office-*"), 2, "--episodes 'office-*': expected a pattern of ids such as walk-1"),
         (("--clock", "realtime"), 2, "--clock realtime: expected --policy artifacts:DIR"),
+        (("--live",), 2, "--live: expected --clock realtime"),
         (("--jobs", "0"), 2, "--jobs: expected 1 to 256, found 0"),
         (("--wording", "9"), 2, "wording 9: episode walk-1 has 4"),
         (("--resume",), 2, "need a directory: add --out DIR"),

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
+from edge.live.options import LiveOptions
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError, PolicySpec
 from sim_hil.benchmark.conditions.latency import LatencyProfile
 from sim_hil.benchmark.env.metrics import FRAME_HZ
@@ -16,7 +18,7 @@ from sim_hil.benchmark.workers.realtime_episode import check_realtime, drivable
 from sim_hil.benchmark.workers.task import EpisodeTask
 from sim_hil.realtime.children import Child, Children, StepError
 from sim_hil.realtime.robots import ROBOTS
-from sim_hil.realtime.stack import StackOptions
+from sim_hil.realtime.stack import Stack, StackOptions
 from sim_hil.realtime.truth import TruePose
 
 POLICY = PolicySpec("artifacts", "out/nano")
@@ -114,6 +116,27 @@ def test_the_true_path_is_sampled_as_in_lockstep(tmp_path: Path, monkeypatch: py
     with pytest.raises(StepError, match="edge-hil"):
         realtime.run_realtime(task, lambda _seconds: None)
     assert asked[asked.index("--pose-hz") + 1] == str(FRAME_HZ)
+
+
+def test_the_runner_of_an_episode_serves_the_live_view_of_the_benchmark(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    live = LiveOptions(port=8770, token_file=tmp_path / "token")
+    task = EpisodeTask.of_json(json.loads(json.dumps(EpisodeTask(episode(), GOOD, tmp_path, live=live).as_json())))
+    assert task.live == live
+    asked: list[str] = []
+
+    def start(_children: Children, step: str, command: Sequence[str]) -> Child:
+        asked.extend(command)
+        raise StepError(step)
+
+    monkeypatch.setattr(Children, "start", start)
+    monkeypatch.setattr(Stack, "start_robot", lambda *_: None)
+    monkeypatch.setattr(Stack, "start_bridge", lambda *_: None)
+    with pytest.raises(StepError, match="edge-run"):
+        realtime.run_realtime(task, lambda _seconds: None)
+    at = asked.index("--live")
+    assert asked[at : at + 6] == live.arguments()
 
 
 def test_a_speed_limit_that_is_none_is_refused(tmp_path: Path) -> None:

@@ -13,8 +13,8 @@ from __future__ import annotations
 import itertools
 import sys
 import time
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -72,12 +72,9 @@ def allowed(now_ns: int) -> bool:
     return int(now_ns / 1e9 / BLOCK_S) % 2 == 0
 
 
-def drive(arguments: Sequence[str]) -> int:
-    """Run `edge-run` with a power governor that allows reasoning in every other block."""
-
-    def budget(_monitor: PowerMonitor) -> ReasoningBudget:
-        return UNLIMITED if allowed(time.monotonic_ns()) else ReasoningBudget(allowed=False)
-
+@contextmanager
+def circling_plans() -> Iterator[None]:
+    """Replace the plans of a runner in this process by a circle; its network still runs."""
     act, calls = Policy.act, itertools.count()
 
     def circling(
@@ -93,8 +90,17 @@ def drive(arguments: Sequence[str]) -> int:
         return opened
 
     with ExitStack() as stack:
-        stack.enter_context(mock.patch.object(PowerMonitor, "budget", budget))
         stack.enter_context(mock.patch.object(session, "open_proven", open_circling))
+        yield
+
+
+def drive(arguments: Sequence[str]) -> int:
+    """Run `edge-run` with a power governor that allows reasoning in every other block."""
+
+    def budget(_monitor: PowerMonitor) -> ReasoningBudget:
+        return UNLIMITED if allowed(time.monotonic_ns()) else ReasoningBudget(allowed=False)
+
+    with mock.patch.object(PowerMonitor, "budget", budget), circling_plans():
         return runner.main(list(arguments))
 
 

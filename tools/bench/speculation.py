@@ -90,7 +90,7 @@ class Variants:
             wall_ns, cpu_ns = time.monotonic_ns(), time.thread_time_ns()
             made = found[name] = work(self.models[name])
             took_ms = ((time.monotonic_ns() - wall_ns) / 1e6, (time.thread_time_ns() - cpu_ns) / 1e6)
-            counts = (made.prompt_tokens, made.new_tokens, made.decode_calls, made.guessed, made.accepted)
+            counts = (made.prompt_tokens, made.new_tokens, len(made.call_tokens), made.guessed, made.accepted)
             self.samples.append(Sample(name, number, *took_ms, made.decode_ms, *counts))
         plain, guessing = found["plain"], found["guessing"]
         equal = np.array_equal(plain.last_layer_kv, guessing.last_layer_kv)

@@ -34,6 +34,7 @@ from sim_hil.benchmark.results.record import EpisodeResult, ResultError
 from sim_hil.benchmark.results.store import StoreError, read_results
 from sim_hil.benchmark.runs import RESULT, RunsError, read_result, run_episodes
 from sim_hil.benchmark.suite.episode import Episode, SuiteError, load_suite
+from sim_hil.benchmark.suite.strata import is_fresh
 from sim_hil.benchmark.workers.jobs import RefusedRunError
 from sim_hil.benchmark.workers.progress import BenchProgress
 from sim_hil.scene.scene import SceneError
@@ -198,7 +199,7 @@ def _run(
     done = len(read_results(folder)) if folder.is_dir() else 0
     _print(f"{name}: {conditions.describe()}; {done} of {len(episodes)} episodes are done")
     started_ns = time.monotonic_ns()
-    with BenchProgress(len(episodes), done) as progress:
+    with BenchProgress(len(episodes), done, blind=is_fresh(args.suite)) as progress:
         run_episodes(
             args.suite,
             episodes,

@@ -39,6 +39,11 @@ class String_(IdlStruct, typename="std_msgs.msg.dds_.String_"):
 
 
 @dataclass
+class Float64_(IdlStruct, typename="std_msgs.msg.dds_.Float64_"):
+    data: t.float64
+
+
+@dataclass
 class Vector3_(IdlStruct, typename="geometry_msgs.msg.dds_.Vector3_"):
     x: t.float64
     y: t.float64

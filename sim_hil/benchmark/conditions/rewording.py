@@ -16,8 +16,9 @@ from sim_hil.benchmark.language.instructions import WordingError, wordings
 from sim_hil.benchmark.language.route import RouteError, describe_route
 from sim_hil.benchmark.suite.episode import Episode
 from sim_hil.benchmark.suite.robots import route_grid
+from sim_hil.layouts.scenes import open_scene
 from sim_hil.scene.nav_grid import NavGrid
-from sim_hil.scene.scene import Scene, load_scene
+from sim_hil.scene.scene import Scene
 
 _TAG = 0x54A9
 
@@ -81,7 +82,7 @@ def training_texts(episodes: Sequence[Episode]) -> Texts:
         if episode.task in texts:
             continue
         if episode.scene not in places:
-            scene = load_scene(episode.scene)
+            scene = open_scene(episode.scene)
             places[episode.scene] = scene, route_grid(scene)
         try:
             found = _training_wordings(episode, *places[episode.scene])

@@ -13,9 +13,10 @@ from edge.core.geometry import SE2
 from sim_hil.benchmark.env.metrics import FRAME_HZ, Outcome, is_success, measure
 from sim_hil.benchmark.env.observation import CAMERA_ASPECT, Observation, Odometer
 from sim_hil.benchmark.suite.episode import Episode
+from sim_hil.layouts.scenes import open_scene
 from sim_hil.robots.interface import Robot
 from sim_hil.robots.odometry_noise import LEVELS
-from sim_hil.scene.scene import Scene, load_scene
+from sim_hil.scene.scene import Scene
 from sim_hil.simulation.physics import Simulation
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ class EpisodeWorld:
         self.options = options if options is not None else WorldOptions()
         self._camera: CameraWorld | None = None
         self._simulation = Simulation(
-            scene if scene is not None else load_scene(episode.scene),
+            scene if scene is not None else open_scene(episode.scene),
             people=episode.people,
             seed=episode.seed,
             robot=episode.robot,

@@ -72,8 +72,13 @@ class ArtifactsPolicy:
         self._switches = asked.over(runtime.switches, stand_at_goal=False)
         self._model = Model(self._artifacts, threads=1)
         self.language = LanguageModel(self._artifacts, threads=1)
-        if self._switches.speculation is Speculation.ON:
-            self.language.speculate()
+        note = self.language.speculate() if self._switches.speculation is Speculation.ON else None
+        rows = max((rows for rows, _ in latency.call_s), default=0)
+        if self._switches.speculation is Speculation.ON and rows > max(self.language.rows[-1], 1):
+            raise ArtifactError(
+                f"{directory}: latency profile {latency.name} has calls of up to {rows} rows, this machine computes at "
+                f"most {self.language.rows[-1]} with equal bits ({note}); choose --speculation off"
+            )
         self._drive: _Drive | None = None
         self.recorder: RecordSink | None = None
         """Takes the records of the next episode and its pictures."""
@@ -92,13 +97,23 @@ class ArtifactsPolicy:
     def reset(self, episode: Episode, instruction: str, world: object | None, seed: int) -> None:
         """Begin an episode without frames and semantic state. Raises InstructionError if the prompt is too long."""
         self.language.check_instruction(instruction)
-        draw = LatencySampler(self._latency, seed, episode.id).draw
+        draw = LatencySampler(self._latency, seed, episode.id, by_calls=True).draw
+        if self._latency.call_s and self._switches.speculation is Speculation.ON:
+            self._guess_for_the_device()
         self._drive = _Drive(
             self._artifacts, self._model, self.language, self._robot, self._mode, instruction, draw, self._switches,
             self.recorder,
         )  # fmt: skip
         if self.recorder is not None:
             self.recorder.put("/run", START_NS, self._run_record(instruction, episode.robot))
+
+    def _guess_for_the_device(self) -> None:
+        """Choose the numbers of guesses by the durations of the profile's device, and begin without earlier texts."""
+        call_ns = {rows: time_s * 1e9 for rows, time_s in self._latency.call_s}
+        if max(call_ns) > 1:
+            self.language.guess_for(call_ns)
+        else:
+            self.language.speculator = None
 
     def _run_record(self, instruction: str, robot: str) -> dict[str, Any]:
         own = None if self._robot.mount is None else asdict(self._robot.mount)

@@ -1,12 +1,13 @@
 """The generation cycle in virtual time (paper appendix D, Algorithms 3 and 4): starts at t, is released at t + L.
 
 No thread and no clock: call `release` before each tick of the control loop, `start` after it. A generation is computed
-when it is released, from the frames that it captured, so the computer's speed changes nothing.
+from the frames that it captured, so the computer's speed changes nothing: when it is released, or, where its latency
+depends on its decoding calls, when they are captured.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,17 +30,20 @@ from edge.state.semantic import SharedState
 from sim_hil.benchmark.conditions.latency import Timing
 
 
-@dataclass(frozen=True)
+@dataclass
 class _UnderWay:
     """Generation in progress; its anchor is set when its newest frame is captured."""
 
     started_ns: int
     timing: Timing
     task: GenerationTask
+    result: GenerationResult | None = None
+    decode_ns: int = 0
+    """Duration of the decoding calls after the first token, where the latency depends on them."""
 
     @property
     def release_ns(self) -> int:
-        return self.started_ns + self.timing.total_ns
+        return self.started_ns + self.timing.total_ns + self.decode_ns
 
     @property
     def capture_ns(self) -> int:
@@ -83,10 +87,8 @@ class VirtualTimeReasoner:
         if under_way is None or under_way.task.anchor is None or now_ns < under_way.release_ns:
             return
         self._under_way = None
-        try:
-            result = self._compute(under_way.task)
-        except GENERATION_ERRORS as error:
-            self._advance(now_ns, Failed(str(error)))
+        result = under_way.result or self._compute(under_way.task, now_ns)
+        if result is None:
             return
         has_waypoints, needs_waypoints = result.waypoints is not None, self._models.policy.guided_by_waypoints
         outputs = self._advance(now_ns, Finished(now_ns, result.generation.new_tokens, has_waypoints, needs_waypoints))
@@ -102,6 +104,8 @@ class VirtualTimeReasoner:
         under_way = self._under_way
         if under_way is not None and under_way.task.anchor is None and now_ns >= under_way.capture_ns:
             self._capture(under_way.task, now_ns)
+            if under_way.task.anchor is not None and under_way.timing.decode_ns is not None:
+                self._compute_calls(under_way, under_way.timing.decode_ns, now_ns)
         self._job.memory.watch(self._ring)
 
     def _advance(self, now_ns: int, event: Event | None = None) -> CycleOutputs:
@@ -117,11 +121,24 @@ class VirtualTimeReasoner:
         task.set_anchor(anchor, self._ring)
         self._advance(now_ns, Anchored(anchor.stamp_ns))
 
-    def _compute(self, task: GenerationTask) -> GenerationResult:
-        run = self._models.language.begin(lambda: False)
-        for number, frame in enumerate(task.older, 1):
-            task.prefill(run, number, frame)
-        return task.finish(run)
+    def _compute(self, task: GenerationTask, now_ns: int) -> GenerationResult | None:
+        """Return the generation's result; None: it failed."""
+        try:
+            run = self._models.language.begin(lambda: False)
+            for number, frame in enumerate(task.older, 1):
+                task.prefill(run, number, frame)
+            return task.finish(run)
+        except GENERATION_ERRORS as error:
+            self._advance(now_ns, Failed(str(error)))
+            return None
+
+    def _compute_calls(self, under_way: _UnderWay, decode_ns: Callable[[Sequence[int]], int], now_ns: int) -> None:
+        """Compute the result now, because its release depends on the calls that its text takes."""
+        under_way.result = self._compute(under_way.task, now_ns)
+        if under_way.result is None:
+            self._under_way = None
+        else:
+            under_way.decode_ns = decode_ns(under_way.result.generation.call_tokens[1:])
 
     def _publish(self, under_way: _UnderWay, result: GenerationResult, outputs: CycleOutputs, now_ns: int) -> None:
         task, number = under_way.task, len(self.released)

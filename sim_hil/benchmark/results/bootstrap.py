@@ -19,8 +19,8 @@ def mean_ci95(values: Sequence[float], tasks: Sequence[str], bounds: Range | Non
     """Return the 95 % interval of the mean of per-episode values; None for fewer than two values.
 
     Two-stage percentile bootstrap, because episodes of one task are correlated: draw tasks with replacement, then as
-    many episodes of each task as it has. If all values are equal, resampling is uninformative: with `bounds` (lowest,
-    highest) the interval is then Wilson's for an event with 0 occurrences, such as [95.7, 100] % for 85 successes in 85
+    many episodes of each task as it has. With `bounds` (lowest, highest) a rate over tasks of one episode has Wilson's
+    interval, and so have equal values, for which resampling is uninformative: [95.7, 100] % for 85 successes in 85
     episodes. Raises ValueError if the numbers of values and tasks differ.
     """
     if len(values) != len(tasks):
@@ -31,8 +31,19 @@ def mean_ci95(values: Sequence[float], tasks: Sequence[str], bounds: Range | Non
     if bounds is not None and np.ptp(array) == 0:
         value, share = float(array[0]), _Z2 / (len(array) + _Z2)
         return value - share * (value - bounds[0]), value + share * (bounds[1] - value)
+    if bounds is not None and len(set(tasks)) == len(tasks) and np.isin(array, bounds).all():
+        return _wilson(array, bounds)
     low, high = np.percentile(_resampled_means(array, tasks), (2.5, 97.5))
     return float(low), float(high)
+
+
+def _wilson(values: NDArray[np.float64], bounds: Range) -> Range:
+    """Return Wilson's 95 % interval of the mean of values that are either the lowest or the highest."""
+    low, high = bounds
+    count, share = len(values), float(np.mean((values - low) / (high - low)))
+    middle = (share + _Z2 / (2 * count)) / (1 + _Z2 / count)
+    half = np.sqrt(_Z2 * (share * (1 - share) / count + _Z2 / (4 * count**2))) / (1 + _Z2 / count)
+    return low + (high - low) * float(middle - half), low + (high - low) * float(middle + half)
 
 
 def paired_ci95(

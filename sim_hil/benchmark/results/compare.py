@@ -15,6 +15,7 @@ from sim_hil.benchmark.results.record import ResultError
 from sim_hil.benchmark.results.report import write_report
 from sim_hil.benchmark.results.store import ResultStore, StoreError, read_config, read_failed, read_results
 from sim_hil.benchmark.results.summary import compare, summarise
+from sim_hil.benchmark.suite.strata import is_fresh
 
 EXAMPLES = """examples:
   edge-bench compare out/async out/sync
@@ -71,7 +72,7 @@ def compared(before: Path, after: Path) -> dict[str, Any]:
     if not result["episodes"]:
         raise StoreError(f"{before} and {after}: expected episodes in common, found none")
     described = [Conditions.of_json(config["conditions"]).describe() for config in configs]
-    return {"before": {"run": str(before), "conditions": described[0]},
+    return {"suite": configs[0]["suite"], "before": {"run": str(before), "conditions": described[0]},
             "after": {"run": str(after), "conditions": described[1]}, **result}  # fmt: skip
 
 
@@ -94,7 +95,6 @@ def _lines(result: dict[str, Any]) -> str:
         lines.append(f"{_UNITS[name]:<14}{values}   {interval}{mark}")
     for key in ("succeeded_in_before_only", "succeeded_in_after_only"):
         if result[key]:
-            lines.append(
-                f"{key.replace('_', ' ').replace('before', 'A').replace('after', 'B')}: {', '.join(result[key])}"
-            )
+            ids = str(len(result[key])) if is_fresh(result["suite"]) else ", ".join(result[key])
+            lines.append(f"{key.replace('_', ' ').replace('before', 'A').replace('after', 'B')}: {ids}")
     return "\n".join(lines) + "\n"

@@ -16,6 +16,7 @@ from edge.flightlog.explain.overlay import Picture
 from edge.flightlog.explain.pictures import card, contact_sheet, drawn_pictures, wanted_stamps
 from edge.flightlog.reader import RecordingError
 from reporting.page import Table
+from sim_hil.benchmark.results.causes import general_reason
 from sim_hil.benchmark.results.record import EpisodeResult
 from sim_hil.benchmark.results.store import FLIGHTS
 
@@ -70,21 +71,17 @@ def counts(found: Sequence[Failure]) -> dict[str, dict[str, int]]:
 
 def cause_table(found: Sequence[Failure]) -> Table:
     """Return the table of causes: what went wrong first, in how many episodes that missed the goal or only collided."""
-    keys = Counter((each.decisive.verdict.cause, _general(each)) for each in found)
+    keys = Counter((each.decisive.verdict.cause, general_reason(each.decisive)) for each in found)
     rows = []
     for (cause, because), count in keys.most_common():
-        members = [each for each in found if (each.decisive.verdict.cause, _general(each)) == (cause, because)]
+        members = [
+            each for each in found if (each.decisive.verdict.cause, general_reason(each.decisive)) == (cause, because)
+        ]
         missed = sum(not each.result.success for each in members)
         example = members[0].result.id
         rows.append((cause, because, str(missed), str(count - missed), f"{100 * count / len(found):.0f}", example))
     head = ("cause", "what went wrong first", "goal missed", "only collided", "% of failures", "example")
     return Table(head, rows, numeric=frozenset({2, 3, 4}))
-
-
-def _general(failure: Failure) -> str:
-    """Return the verdict's sentence without the name of the object, so that equal failures count together."""
-    event, because = failure.decisive.event, failure.decisive.verdict.because
-    return because.replace(event.detail, "an object") if event.kind == "collision" else because
 
 
 def failure_sheet(found: Sequence[Failure]) -> bytes | None:

@@ -14,13 +14,16 @@ from edge.core.cli import write_whole
 from reporting.page import Cell, Figure, Table, mark, render
 from reporting.plot_style import BAD, GOOD, INK, MUTED, TRUTH, delay_histogram, legend_above, new_figure, png, tidy
 from sim_hil.benchmark.conditions.conditions import Conditions
+from sim_hil.benchmark.results.causes import cause_tables, read_causes
 from sim_hil.benchmark.results.failures import cause_table, failure_sheet, failures
 from sim_hil.benchmark.results.record import EpisodeResult, read_log
 from sim_hil.benchmark.results.store import EPISODES, VIDEOS, ResultStore
-from sim_hil.benchmark.results.summary import GROUPS, METRICS, grouped_by, interval_of
+from sim_hil.benchmark.results.summary import METRICS, group_names, grouped_by, interval_of
 from sim_hil.benchmark.results.video import last_picture
+from sim_hil.benchmark.suite.strata import is_fresh
+from sim_hil.layouts.scenes import open_scene
 from sim_hil.scene.map import draw_map, draw_mark, draw_path, map_view
-from sim_hil.scene.scene import Scene, SceneError, load_scene
+from sim_hil.scene.scene import Scene, SceneError
 
 REPORT = "report.html"
 SHOWN_TEXTS = 12
@@ -36,7 +39,17 @@ _HEADLINE = {
 
 Path2 = NDArray[np.float64]
 
-_TITLES = {"scene": "scene", "crowd": "people in the scene", "robot": "robot"}
+_OF_EPISODES = (
+    "error_and_time", "delays", "maps", "endings", "failure_sheet", "failure_cards", "texts", "episodes",
+)  # fmt: skip
+"""Values of the page that show single episodes."""
+_TITLES = {
+    "scene": "scene",
+    "crowd": "people in the scene",
+    "robot": "robot",
+    "length": "length of the path",
+    "turns": "turns",
+}
 _MAP_PX = 1400
 _SUCCESS, _COLLIDED, _FAILED = (44, 140, 74), (230, 140, 20), (179, 38, 30)
 _START, _GOAL = (31, 111, 139), (44, 140, 74)
@@ -68,15 +81,13 @@ def _results(
     store: ResultStore, results: Sequence[EpisodeResult], summary: Mapping[str, Any], conditions: Conditions
 ) -> dict[str, object]:
     """Return the values of the part of the page about finished episodes."""
+    if is_fresh(store.config["suite"]):
+        return _strata(store, results, summary, conditions)
     logs = {result.id: _log(store.directory, result.id) for result in results}
     delays = np.array([d for log in logs.values() if log for d in log["columns"]["delay_s"] if d is not None], float)
     caption = "Age of the semantic state in every control period that had one."
     return {
-        "rates": Figure(
-            rates(results), "Bars of success and collision rate",
-            "The number of episodes is below each name.", wide=True,
-        ),
-        "groups": _group_table(summary),
+        **_rates(results, summary),
         "error_and_time": Figure(
             error_and_time(results, width_in=5.4 if len(delays) else 11.0),
             "Distance to the goal against time used", "One point per episode.", wide=not len(delays),
@@ -87,8 +98,32 @@ def _results(
         **_failures(store.directory, results),
         "texts": _texts(results, logs),
         "episodes": _episode_table(store.directory, results),
-        "facts": Table(("what", "value"), [(key, str(value)) for key, value in _facts(store.config, conditions)]),
+        "facts": _fact_table(store.config, conditions),
     }  # fmt: skip
+
+
+def _rates(results: Sequence[EpisodeResult], summary: Mapping[str, Any]) -> dict[str, object]:
+    """Return the values of the part of the page about rates by group."""
+    caption = "The number of episodes is below each name."
+    figure = Figure(rates(results), "Bars of success and collision rate", caption, wide=True)
+    return {"rates": figure, "groups": _group_table(summary)}
+
+
+def _strata(
+    store: ResultStore, results: Sequence[EpisodeResult], summary: Mapping[str, Any], conditions: Conditions
+) -> dict[str, object]:
+    """Return the values of a page without episodes: rates and counts of causes by stratum."""
+    causes = read_causes(store.directory, results)
+    by_group, reasons = cause_tables(results, causes)
+    failed = sum(not result.success or result.collided for result in results)
+    return {
+        **_rates(results, summary),
+        "explained": f"{len(causes)} of {failed} failed episodes",
+        "causes": by_group if causes else None,
+        "reasons": reasons,
+        **dict.fromkeys(_OF_EPISODES),
+        "facts": _fact_table(store.config, conditions),
+    }
 
 
 def _failures(directory: Path, results: Sequence[EpisodeResult]) -> dict[str, object]:
@@ -98,6 +133,7 @@ def _failures(directory: Path, results: Sequence[EpisodeResult]) -> dict[str, ob
     return {
         "explained": f"{len(found)} of {failed} failed episodes",
         "causes": cause_table(found) if found else None,
+        "reasons": None,
         "failure_sheet": failure_sheet(found),
         "failure_cards": [failure.card for failure in found],
     }
@@ -133,7 +169,8 @@ def _group_table(summary: Mapping[str, Any]) -> Table:
             str(means["episodes"]),
             *(_with_interval(means, name) for name in METRICS),
         )
-        for group in ("by_scene", "by_crowd", "by_robot")
+        for group in summary
+        if group.startswith("by_")
         for key, means in summary[group].items()
     ]
     head = ("group", "episodes", "SR %", "SPL %", "NE m", "CR %")
@@ -152,7 +189,7 @@ def _maps(results: Sequence[EpisodeResult], logs: Mapping[str, dict[str, Any] | 
     for name, members in grouped_by(results, "scene"):
         shown = [(result, log) for result in members if (log := logs[result.id]) is not None]
         try:
-            scene = load_scene(name)
+            scene = open_scene(name)
         except SceneError:
             parts.append(name)
             continue
@@ -218,6 +255,10 @@ def _episode_table(directory: Path, results: Sequence[EpisodeResult]) -> Table:
     return Table(head, rows, numeric=frozenset({3, *range(6, 12)}))
 
 
+def _fact_table(config: Mapping[str, Any], conditions: Conditions) -> Table:
+    return Table(("what", "value"), [(key, str(value)) for key, value in _facts(config, conditions)])
+
+
 def _facts(config: Mapping[str, Any], conditions: Conditions) -> list[tuple[str, object]]:
     latency = conditions.latency
     facts: list[tuple[str, object]] = [("conditions", conditions.describe())]
@@ -229,8 +270,8 @@ def _facts(config: Mapping[str, Any], conditions: Conditions) -> list[tuple[str,
 
 
 def rates(results: Sequence[EpisodeResult]) -> bytes:
-    """Plot success and collision rate with 95 % bootstrap intervals, by scene, crowd and robot."""
-    groups = [(name, grouped_by(results, name)) for name in GROUPS]
+    """Plot success and collision rate with 95 % intervals, by scene, crowd, robot and stratum."""
+    groups = [(name, grouped_by(results, name)) for name in group_names(results)]
     widths = [max(1, len(members)) + 0.6 for _, members in groups]
     figure = new_figure(11.0, 3.6)
     all_axes = figure.subplots(1, len(groups), sharey=True, width_ratios=widths)

@@ -3,7 +3,7 @@
 config.json     conditions, episodes, versions: written first, never changed; a resumed run must have the same
 results.jsonl   one line per finished episode, appended whole
 failed.jsonl    episodes whose process died in every attempt; a resumed run tries them again
-episodes/ID.json, videos/ID.mp4, flights/ID.mcap    written before their line in results.jsonl
+episodes/ID.json, videos/ID.mp4, flights/ID.mcap, causes/ID.json    written before their line in results.jsonl
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from firmware_bridge.system.input_file import read_json
 from sim_hil.benchmark.results.record import EpisodeResult, FailedRun, ResultError
 
 CONFIG, RESULTS, FAILED = "config.json", "results.jsonl", "failed.jsonl"
-EPISODES, VIDEOS, FLIGHTS = "episodes", "videos", "flights"
+EPISODES, VIDEOS, FLIGHTS, CAUSES = "episodes", "videos", "flights", "causes"
 
 
 class StoreError(ValueError):

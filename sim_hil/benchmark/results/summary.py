@@ -7,6 +7,7 @@ from typing import Any
 
 from sim_hil.benchmark.results.bootstrap import Range, mean_ci95, paired_ci95
 from sim_hil.benchmark.results.record import EpisodeResult, ResultError
+from sim_hil.benchmark.suite.strata import LENGTHS_M, band_of, kind_of, turns_of
 
 CROWD_LEVELS = ((0, "0"), (20, "1-20"), (40, "21-40"), (60, "41-60"), (10_000, "61 and more"))
 """Crowd levels: (maximum number of people, name)."""
@@ -24,10 +25,20 @@ _SAME = ("task", "scene", "robot", "people", "seed", "shortest_m", "timeout_s")
 """Fields that must agree in two results with the same id: the id alone does not identify an episode."""
 
 GROUPS: dict[str, Callable[[EpisodeResult], str]] = {
-    "scene": lambda result: result.scene,
+    "scene": lambda result: kind_of(result.scene),
     "crowd": lambda result: crowd_level(result.people),
     "robot": lambda result: result.robot,
+    "length": lambda result: band_of(result.shortest_m) or "other",
+    "turns": lambda result: str(turns_of(result.task)),
 }
+"""Name of the group of one episode, by kind of group; `length` and `turns` exist in a stratified suite alone."""
+_STRATA = ("length", "turns")
+
+
+def group_names(results: Sequence[EpisodeResult]) -> list[str]:
+    """Return the kinds of groups that results have, keys of GROUPS."""
+    stratified = bool(results) and all(turns_of(result.task) is not None for result in results)
+    return [name for name in GROUPS if stratified or name not in _STRATA]
 
 
 def crowd_level(people: int) -> str:
@@ -36,18 +47,21 @@ def crowd_level(people: int) -> str:
 
 
 def summarise(results: Sequence[EpisodeResult]) -> dict[str, Any]:
-    """Return `episodes`, each metric's mean and `*_ci95`, and the same under `by_scene`, `by_crowd`, `by_robot`."""
+    """Return `episodes`, each metric's mean and `*_ci95`, and the same for each group under `by_scene` and so on."""
     results = sorted(results, key=lambda result: result.id)  # a sum's last digits depend on the order
-    grouped = {f"by_{name}": {key: _means(members) for key, members in grouped_by(results, name)} for name in GROUPS}
+    grouped = {
+        f"by_{name}": {key: _means(members) for key, members in grouped_by(results, name)}
+        for name in group_names(results)
+    }
     return {**_means(results), **grouped}
 
 
 def grouped_by(results: Iterable[EpisodeResult], name: str) -> list[tuple[str, list[EpisodeResult]]]:
-    """Group results by scene, crowd or robot; crowd levels in ascending order, other groups by name."""
+    """Group results by a key of GROUPS; crowds and lengths in ascending order, other groups by name."""
     groups: dict[str, list[EpisodeResult]] = {}
     for result in results:
         groups.setdefault(GROUPS[name](result), []).append(result)
-    order = [level for _, level in CROWD_LEVELS]
+    order = [*(level for _, level in CROWD_LEVELS), *LENGTHS_M]
     return sorted(groups.items(), key=lambda item: (order.index(item[0]) if item[0] in order else 0, item[0]))
 
 

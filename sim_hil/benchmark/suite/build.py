@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from edge.core.cli import command_line, write_named
 from firmware_bridge.system.terminal import CommandParser
 from sim_hil.benchmark.language.instruction_reading import untrue
 from sim_hil.benchmark.language.instructions import WordingError, wordings
-from sim_hil.benchmark.language.route import RouteError
+from sim_hil.benchmark.language.route import RouteDescription, RouteError
 from sim_hil.benchmark.language.task_checks import named_landmarks, named_too_small, worst_leak, wrong_bends
 from sim_hil.benchmark.language.tasks import Task, goals, sample_task
 from sim_hil.benchmark.language.visibility import Sightlines
@@ -30,7 +30,18 @@ NAME, VERSION = "dynanav", 2
 WORDINGS = 6
 INDOOR_CROWDS = (0, 10, 20, 40, 60)
 _DRAWS = 400
-_LEAST_LEG_M = 3.0
+LEAST_LEG_M = 3.0
+"""Shortest leg before a turn, m: turns in quick succession, or right after the start, are ambiguous."""
+
+
+def count_turns(route: RouteDescription) -> int:
+    """Return the number of a route's turns; a crossing counts as one."""
+    return sum(step.side != "straight" or step.kind == "crossing" for step in route.steps)
+
+
+def has_clear_legs(route: RouteDescription) -> bool:
+    """Return whether every turn comes LEAST_LEG_M after the start or the turn before, or leaves a room."""
+    return all(step.before_m >= LEAST_LEG_M for step in route.steps if step.before_kind != "room")
 
 
 @dataclass(frozen=True)
@@ -49,15 +60,13 @@ class Wanted:
         """Return whether a drawn task meets the requirements."""
         thing = next(thing for thing in scene.objects if thing.label == task.goal_label)
         route = task.route
-        turns = sum(step.side != "straight" or step.kind == "crossing" for step in route.steps)
         return (
             thing.kind in self.kinds
             and self.length_m[0] <= route.length_m <= self.length_m[1]
-            and self.turns[0] <= turns <= self.turns[1]
+            and self.turns[0] <= count_turns(route) <= self.turns[1]
             and (not self.area_kinds or route.goal_area_kind in self.area_kinds)
             and (not self.at_end or route.goal_at_end)
-            # Turns in quick succession, or right after the start, are ambiguous.
-            and all(step.before_m >= _LEAST_LEG_M for step in route.steps if step.before_kind != "room")
+            and has_clear_legs(route)
             and (not self.counted or any(step.ordinal >= self.counted for step in route.steps))
         )
 
@@ -123,7 +132,7 @@ def build_part(part: Part, progress: Callable[[str], None] = lambda line: None) 
     for index, (wanted, task) in enumerate(_tasks(part, scene)):
         name = f"{part.scene}-{wanted.task}"
         progress(f"{name}: {task.route.length_m:.1f} m, {len(task.route.steps)} steps")
-        texts = tuple(_wordings(task, part.seed * 1000 + index))
+        texts = tuple(wordings(task.route, WORDINGS, part.seed * 1000 + index, held_out=True))
         lengths = {robot: round(grids[robot].distance_m(task.start[:2], task.goal), 3) for robot in ROBOTS}
         for number, people in enumerate(part.crowds[index]):
             # Each task occurs with both robots, and so does each crowd over a scene's tasks.
@@ -154,10 +163,6 @@ def build(progress: Callable[[str], None] = lambda line: None) -> str:
     return suite_to_toml(NAME, VERSION, [episode for part in PARTS for episode in build_part(part, progress)])
 
 
-def _wordings(task: Task, seed: int) -> list[str]:
-    return wordings(task.route, WORDINGS, seed, held_out=True)
-
-
 def _tasks(part: Part, scene: Scene) -> list[tuple[Wanted, Task]]:
     """Return for each requirement the first drawn task that meets it and is valid; goals are distinct."""
     rng = np.random.default_rng((part.seed, 17))
@@ -185,12 +190,19 @@ def _tasks(part: Part, scene: Scene) -> list[tuple[Wanted, Task]]:
 def _is_valid(part: Part, scene: Scene, grid: NavGrid, lines: Sightlines, task: Task, seed: int) -> bool:
     """Return whether a task passes the checks of the validator."""
     try:
-        texts = _wordings(task, seed)
+        texts = wordings(task.route, WORDINGS, seed, held_out=True)
     except WordingError:
         return False
+    return is_true(task, texts, scene, grid, lines, part.threshold_m)
+
+
+def is_true(
+    task: Task, texts: Sequence[str], scene: Scene, grid: NavGrid, lines: Sightlines, threshold_m: float
+) -> bool:  # fmt: skip
+    """Return whether a task with these instructions passes the validator's checks; `grid`: that of `route_grid`."""
     if any(untrue(text, task.route) for text in texts):
         return False
-    if worst_leak(grid, task.goal, part.threshold_m) > 0 or wrong_bends(task.route, task.path):
+    if worst_leak(grid, task.goal, threshold_m) > 0 or wrong_bends(task.route, task.path):
         return False
     return not named_too_small(scene, lines, task.path, named_landmarks(texts, task.route))
 
@@ -199,19 +211,22 @@ def _print_progress(line: str) -> None:
     sys.stderr.write(line + "\n")
 
 
-@command_line("build_suite")
-def main(argv: list[str] | None = None) -> int:
-    """Write or check the suite file; return the exit code."""
+def build_command(
+    argv: Sequence[str] | None, name: str, module: str, make: Callable[[Callable[[str], None]], str]
+) -> int:  # fmt: skip
+    """Write or check the file of suite `name`, whose text `make` returns; return the exit code."""
+    path = SUITES / f"{name}.toml"
     parser = CommandParser(
-        prog="python -m sim_hil.benchmark.suite.build", description="Build the DynaNav suite from its scenes.",
-        epilog="example: python -m sim_hil.benchmark.suite.build --out sim_hil/benchmark/suite/suites/dynanav.toml",
+        prog=f"python -m {module}", description=f"Build the suite {name}.",
+        epilog=f"examples:\n  python -m {module}\n  python -m {module} --check --out FILE\n"
+        "exit codes: 0 done, 1 the file differs or cannot be built, 2 bad arguments",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
-    parser.add_argument("--out", type=Path, default=SUITES / f"{NAME}.toml", metavar="FILE")
+    parser.add_argument("--out", type=Path, default=path, metavar="FILE", help=f"suite file (default: {name}.toml)")
     parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 if the file differs")
     args = parser.parse_args(argv)
     try:
-        text = build(_print_progress)
+        text = make(_print_progress)
         if args.check:
             same = args.out.read_text(encoding="utf-8") == text
             _print_progress(
@@ -223,6 +238,12 @@ def main(argv: list[str] | None = None) -> int:
         sys.stderr.write(f"{error}\n")
         return 1
     return 0
+
+
+@command_line("build_suite")
+def main(argv: list[str] | None = None) -> int:
+    """Run the command and return its exit code."""
+    return build_command(argv, NAME, "sim_hil.benchmark.suite.build", build)
 
 
 if __name__ == "__main__":

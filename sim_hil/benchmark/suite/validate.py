@@ -22,8 +22,9 @@ from sim_hil.benchmark.language.tasks import outline_gap_m
 from sim_hil.benchmark.language.visibility import Sightlines
 from sim_hil.benchmark.suite.episode import ROBOTS, Episode, SuiteError, load_suite, suite_names
 from sim_hil.benchmark.suite.robots import ROUTE_CLEARANCE_M, robot_grid, route_grid
+from sim_hil.layouts.scenes import open_scene
 from sim_hil.scene.nav_grid import NavGrid
-from sim_hil.scene.scene import Scene, SceneError, SceneObject, Vec2, load_scene
+from sim_hil.scene.scene import Scene, SceneError, SceneObject, Vec2
 
 # Mean speeds at which an episode must be feasible, m/s. Indoors this is below the Go2's mean speed in sync mode
 # (0.146 m/s: halts of 2 s before each 0.5 s of driving) and leaves room for detours.
@@ -76,7 +77,7 @@ class Validator:
     def problems(self, episode: Episode) -> list[str]:
         """Return the problems of an episode, one line each."""
         if episode.scene not in self._places:
-            self._places[episode.scene] = _Place(load_scene(episode.scene))
+            self._places[episode.scene] = _Place(open_scene(episode.scene))
         place = self._places[episode.scene]
         found = _feasible(episode, place)
         # Checks that do not depend on robot and crowd run once per task.

@@ -12,8 +12,10 @@ SHOWN = 4
 class BenchProgress(Progress):
     """Progress display; pass `watcher` to the run."""
 
-    def __init__(self, total: int, done: int) -> None:
+    def __init__(self, total: int, done: int, *, blind: bool = False) -> None:
+        """`blind`: show counts, and no single episode."""
         super().__init__("", bar=True, period_s=None)
+        self._blind = blind
         self._episodes, self._ended = total, done
         self._reached = 0
         self._collided = 0
@@ -30,7 +32,8 @@ class BenchProgress(Progress):
         end = "reached" if result.success else result.end
         hit = f", collided with {', '.join(result.collisions)}" if result.collided else ""
         took = f"{result.time_s:.0f} s simulated in {result.wall_s:.0f} s"
-        self.log(f"[{self._ended}/{self._episodes}] {result.id}: {end}, {result.ne_m:.1f} m from the goal{hit}; {took}")
+        what = f"{result.id}: {end}, {result.ne_m:.1f} m from the goal{hit}; "
+        self.log(f"[{self._ended}/{self._episodes}] {'' if self._blind else what}{took}")
         self._reached += result.success
         self._collided += result.collided
         self._advance()

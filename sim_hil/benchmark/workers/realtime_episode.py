@@ -95,6 +95,7 @@ def run_realtime(task: EpisodeTask, on_time: OnTime) -> EpisodeResult:
         mode=conditions.mode or "async",
         odometry_noise=conditions.drift,
         switches=conditions.switches,
+        live=task.live,
         pose_hz=FRAME_HZ,
     )
     with _asked_to_end(), Stack(options) as stack:

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from typing import TYPE_CHECKING
 
 from sim_hil.benchmark.conditions.conditions import ConditionsError
 from sim_hil.benchmark.env.world import EpisodeWorld, WorldOptions
 from sim_hil.benchmark.policies.artifacts_policy import START_NS, ArtifactsPolicy
+from sim_hil.benchmark.policies.policy import Policy
 from sim_hil.benchmark.policies.select import camera_for, open_policy
 from sim_hil.benchmark.results.flight import EpisodeFlight
 from sim_hil.benchmark.results.record import EpisodeLog, EpisodeResult
 from sim_hil.benchmark.workers.task import EpisodeTask, episode_result
+from sim_hil.scene.scene import Scene
 
 if TYPE_CHECKING:
     from sim_hil.benchmark.results.video import EpisodeVideo
@@ -25,12 +27,21 @@ OnTime = Callable[[float], None]
 def run_lockstep(task: EpisodeTask, on_time: OnTime) -> EpisodeResult:
     """Run an episode in virtual time: the world waits for the policy, so the same task gives identical results."""
     started_ns = time.monotonic_ns()
+    with closing(open_policy(task.conditions, task.manifest_sha256)) as policy:
+        return drive(task, policy, on_time, started_ns=started_ns)
+
+
+def drive(
+    task: EpisodeTask, policy: Policy, on_time: OnTime, *, started_ns: int, scene: Scene | None = None
+) -> EpisodeResult:  # fmt: skip
+    """Let a policy drive an episode in virtual time; `scene` replaces opening the episode's scene by name.
+
+    `started_ns`: when the task began, by time.monotonic_ns.
+    """
     episode, log = task.episode, EpisodeLog()
     with ExitStack() as cleanup:
-        policy = open_policy(task.conditions, task.manifest_sha256)
-        cleanup.callback(policy.close)
         options = WorldOptions(camera=camera_for(task.conditions, policy), drift=task.conditions.drift)
-        world = EpisodeWorld(episode, options)
+        world = EpisodeWorld(episode, options, scene=scene)
         cleanup.callback(world.close)
         video = None if task.video == "none" else _video(task)
         if video is not None:
@@ -64,6 +75,8 @@ def run_lockstep(task: EpisodeTask, on_time: OnTime) -> EpisodeResult:
             video.keep()
         if flight is not None and (task.flights == "all" or not outcome.success or outcome.collided):
             flight.keep(world, outcome)
+            if task.flights == "causes":
+                _keep_cause(task)
         count = None if generations is None else len(generations)
         return episode_result(
             task, outcome, log, generations=count, stopped_by=str(notes.get("stopped_by", "")), started_ns=started_ns
@@ -74,6 +87,12 @@ def _video(task: EpisodeTask) -> EpisodeVideo:
     from sim_hil.benchmark.results.video import EpisodeVideo  # here: fonts and drawing are only needed for this
 
     return EpisodeVideo(task.video_path, task.episode, task.instruction)
+
+
+def _keep_cause(task: EpisodeTask) -> None:
+    from sim_hil.benchmark.results.causes import keep_cause  # here: most episodes need no explanation
+
+    keep_cause(task.flight_path, task.folder)
 
 
 def _realtime(task: EpisodeTask, on_time: OnTime) -> EpisodeResult:

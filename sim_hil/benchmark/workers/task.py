@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from edge.live.options import LiveOptions
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.env.metrics import Outcome
 from sim_hil.benchmark.results.record import EpisodeLog, EpisodeResult
@@ -16,6 +17,8 @@ from sim_hil.benchmark.results.store import EPISODES, FLIGHTS, VIDEOS
 from sim_hil.benchmark.suite.episode import Episode, SuiteError
 
 VIDEO_CHOICES = ("all", "failed", "none")
+FLIGHT_CHOICES = (*VIDEO_CHOICES, "causes")
+"""Flight logs to keep; `causes`: none, but the cause of each failure."""
 
 
 @dataclass(frozen=True)
@@ -29,11 +32,13 @@ class EpisodeTask:
     flights: str = "none"
     manifest_sha256: str = ""
     attempt: int = 1
+    live: LiveOptions | None = None
+    """Where the runner's live view listens, in real time."""
 
     def __post_init__(self) -> None:
-        for name, choice in (("video", self.video), ("flights", self.flights)):
-            if choice not in VIDEO_CHOICES:
-                raise ConditionsError(f"{name} {choice!r}: expected one of {', '.join(VIDEO_CHOICES)}")
+        for name, choice, known in (("video", self.video, VIDEO_CHOICES), ("flights", self.flights, FLIGHT_CHOICES)):
+            if choice not in known:
+                raise ConditionsError(f"{name} {choice!r}: expected one of {', '.join(known)}")
         wordings = len(self.episode.instructions)
         if self.conditions.wording >= wordings:
             raise ConditionsError(
@@ -64,6 +69,8 @@ class EpisodeTask:
         """Return the task as JSON values, to be read by `of_json`."""
         values = {key: getattr(self, key) for key in ("video", "flights", "manifest_sha256", "attempt")}
         conditions = self.conditions.as_json()
+        live = self.live
+        values["live"] = None if live is None else [live.address, live.port, str(live.token_file)]
         return {**values, "episode": asdict(self.episode), "conditions": conditions, "folder": str(self.folder)}
 
     @staticmethod
@@ -72,6 +79,9 @@ class EpisodeTask:
         try:
             raw: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in content["episode"].items()}
             rest = {key: content[key] for key in ("video", "flights", "manifest_sha256", "attempt")}
+            if content.get("live") is not None:
+                address, port, token_file = content["live"]
+                rest["live"] = LiveOptions(address, port, Path(token_file))
             conditions = Conditions.of_json(content["conditions"])
             return EpisodeTask(Episode(**raw), conditions, Path(content["folder"]), **rest)
         except (KeyError, TypeError, AttributeError) as error:

@@ -20,11 +20,11 @@ from firmware_bridge.dds.binding import has_reader
 from firmware_bridge.dds.bus import DDS_ERRORS, Bus
 from firmware_bridge.ros2.messages.sensors import CameraInfo_, CompressedImage_
 from firmware_bridge.system.terminal import CommandParser
+from sim_hil.layouts.scenes import open_scene
 from sim_hil.processes.child_process import input_is_open, take_standard_output, write_message
-from sim_hil.protocols.render_process import encode_jpeg
+from sim_hil.protocols.render_process import PictureView, encode_jpeg
 from sim_hil.protocols.ros2.topics import CAMERA_FRAME, CAMERA_INFO_TOPIC, IMAGE_TOPIC, camera_info, header
 from sim_hil.protocols.snapshot import SnapshotReader, TornSnapshotError
-from sim_hil.scene.scene import load_scene
 from sim_hil.simulation.camera import CameraWorld
 from sim_hil.simulation.sensor_noise import SensorNoise
 
@@ -35,15 +35,17 @@ _IDLE_S: Final = 0.05
 class CameraNode:
     """Renders the newest pose and publishes it with the stamp of that pose."""
 
-    def __init__(self, bus: Bus, world: CameraWorld, poses: SnapshotReader, noise: SensorNoise) -> None:
-        self._world, self._poses, self._noise = world, poses, noise
+    def __init__(
+        self, bus: Bus, world: CameraWorld, poses: SnapshotReader, noise: SensorNoise, view: PictureView
+    ) -> None:
+        self._world, self._poses, self._noise, self._view = world, poses, noise, view
         self._images: DataWriter[CompressedImage_] = bus.writer(IMAGE_TOPIC, CompressedImage_)
         self._lens: DataWriter[CameraInfo_] = bus.writer(CAMERA_INFO_TOPIC, CameraInfo_)
 
     @property
     def wanted(self) -> bool:
-        """Whether a node subscribes to pictures or intrinsics."""
-        return has_reader(self._images) or has_reader(self._lens)
+        """Whether a node subscribes to pictures or intrinsics, or the live view lacks one."""
+        return has_reader(self._images) or has_reader(self._lens) or self._view.is_due
 
     def publish(self, width: int, height: int) -> bool:
         """Render and publish one picture; False without a pose. Raises TornSnapshotError."""
@@ -52,6 +54,7 @@ class CameraNode:
             return False
         stamp_s = float(state[-1])
         jpeg = encode_jpeg(self._noise.add(self._world.render(state[:-1], width, height)))
+        self._view.show(jpeg)
         with contextlib.suppress(*DDS_ERRORS):  # a network that is away for a moment costs this picture only
             self._images.write(CompressedImage_(header(stamp_s, CAMERA_FRAME), "jpeg", jpeg))
             self._lens.write(camera_info(width, height, stamp_s))
@@ -82,15 +85,16 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--peer", action="append", default=[])
     for name in ("people", "seed", "width", "height", "domain", "pose-fd"):
         parser.add_argument(f"--{name}", type=int, required=True)
+    parser.add_argument("--view-fd", type=int)
     args = parser.parse_args(argv)
     # Ctrl-C reaches the whole process group, but the parent decides when the camera ends.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     pipe = take_standard_output()
-    world = CameraWorld(load_scene(args.scene), people=args.people, seed=args.seed, robot="carter")
+    world = CameraWorld(open_scene(args.scene), people=args.people, seed=args.seed, robot="carter")
     poses = SnapshotReader(args.pose_fd, world.state_size + 1)
     bus = Bus(DdsConfig(args.domain, args.interface, tuple(args.peer)))
-    node = CameraNode(bus, world, poses, SensorNoise(args.width, args.height, args.seed))
+    node = CameraNode(bus, world, poses, SensorNoise(args.width, args.height, args.seed), PictureView(args.view_fd))
     # BrokenPipeError: the parent died between two checks of stdin.
     with contextlib.closing(world), contextlib.closing(poses), contextlib.suppress(BrokenPipeError):
         write_message(pipe, {"event": "ready"})

@@ -32,12 +32,13 @@ class FaultyVideoHub(VideoHub):
         server: ServiceServer,
         render: Callable[[], bytes | None],
         report: Callable[[dict[str, object]], None],
+        show: Callable[[bytes], None] = lambda jpeg: None,
         *,
         size: tuple[int, int],
         commands_fd: int,
     ) -> None:
         """Create the service; `size`: image size (width, height), px; `commands_fd`: descriptor of the commands."""
-        super().__init__(server, render, report)
+        super().__init__(server, render, report, show)
         self._size = size
         self._fd = commands_fd
         os.set_blocking(commands_fd, False)

@@ -107,6 +107,7 @@ class FaultInjector(FaultEndpoint):
         self._remote = remote
         self._camera = camera
         self._open_requests: dict[str, tuple[FaultCommand, str]] = {}  # by fault: command and sender
+        self._injected: set[str] = set()
 
     def poll(self, now_ns: int) -> None:
         """Handle the requests that have arrived and report effects since the last poll, without waiting."""
@@ -118,6 +119,10 @@ class FaultInjector(FaultEndpoint):
         for name, effect_ns in (*self.states.effects(), *self.sport.effects()):
             self.took_effect(name, effect_ns)
 
+    def injected(self) -> tuple[str, ...]:
+        """Return the faults that are switched on; one that happens once is on until it is switched off."""
+        return tuple(sorted(self._injected))
+
     def took_effect(self, fault: str, effect_ns: int) -> None:
         """Answer the request for a fault that has taken effect."""
         request = self._open_requests.pop(fault, None)
@@ -128,6 +133,7 @@ class FaultInjector(FaultEndpoint):
     def _switch(self, command: FaultCommand, sender: str, now_ns: int) -> None:
         if command.fault == CLEAR:
             self._open_requests.clear()
+            self._injected.clear()
             self.states.clear()
             self.sport.clear()
             self._remote.release()
@@ -135,6 +141,7 @@ class FaultInjector(FaultEndpoint):
             self._answer(sender, {"fault": CLEAR, "on": False, "effect_ns": now_ns})
             return
         self._open_requests[command.fault] = (command, sender)
+        (self._injected.add if command.on else self._injected.discard)(command.fault)
         where = KINDS[command.fault].where
         if where == "camera":
             self._camera(command.line())

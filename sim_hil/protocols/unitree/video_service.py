@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 from collections.abc import Callable
@@ -18,15 +19,20 @@ class VideoHub:
     """Video service: one render answers all waiting GetImageSample requests."""
 
     def __init__(
-        self, server: ServiceServer, render: Callable[[], bytes | None], report: Callable[[dict[str, object]], None]
+        self,
+        server: ServiceServer,
+        render: Callable[[], bytes | None],
+        report: Callable[[dict[str, object]], None],
+        show: Callable[[bytes], None] = lambda jpeg: None,
     ) -> None:
         """Create the service; `render` returns a JPEG, None without a pose, or raises TornSnapshotError.
 
-        `report` sends an event to the parent.
+        `report` sends an event to the parent. `show` takes every picture that is sent.
         """
         self._server = server
         self._render = render
         self._report = report
+        self._show = show
         self._malformed = 0
 
     def serve(self) -> None:
@@ -65,3 +71,11 @@ class VideoHub:
     def _send(self, request: Received, jpeg: bytes) -> None:
         self._server.reply(request, ids.OK, "", jpeg)
         self._report({"event": "frame", "t_ns": time.monotonic_ns()})
+        self._show(jpeg)
+
+    def show_unasked(self) -> None:
+        """Show a picture that nobody has requested."""
+        with contextlib.suppress(TornSnapshotError):
+            jpeg = self._render()
+            if jpeg is not None:
+                self._show(jpeg)

@@ -17,12 +17,12 @@ from firmware_bridge.core.config import DdsConfig
 from firmware_bridge.dds.bus import Bus
 from firmware_bridge.system.terminal import CommandParser
 from firmware_bridge.unitree.messages import ids
+from sim_hil.layouts.scenes import open_scene
 from sim_hil.processes.child_process import input_is_open, take_standard_output, write_message
-from sim_hil.protocols.render_process import encode_jpeg
+from sim_hil.protocols.render_process import PictureView, encode_jpeg
 from sim_hil.protocols.snapshot import SnapshotReader
 from sim_hil.protocols.unitree.services.service import ServiceServer
 from sim_hil.protocols.unitree.video_service import VideoHub
-from sim_hil.scene.scene import load_scene
 from sim_hil.simulation.camera import CameraWorld
 from sim_hil.simulation.sensor_noise import SensorNoise
 
@@ -42,6 +42,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--interface", required=True)
     parser.add_argument("--peer", action="append", default=[])
     parser.add_argument("--pose-fd", type=int, required=True)
+    parser.add_argument("--view-fd", type=int)
     parser.add_argument("--faults", action="store_true")
     args = parser.parse_args(argv)
     # A Ctrl-C reaches the whole process group; the parent decides when the camera ends.
@@ -49,7 +50,7 @@ def main(argv: list[str] | None = None) -> int:
         signal.signal(number, signal.SIG_IGN)
     report = functools.partial(write_message, take_standard_output())
 
-    world = CameraWorld(load_scene(args.scene), people=args.people, seed=args.seed)
+    world = CameraWorld(open_scene(args.scene), people=args.people, seed=args.seed)
     poses = SnapshotReader(args.pose_fd, world.state_size)
 
     noise = SensorNoise(args.width, args.height, args.seed)
@@ -61,12 +62,13 @@ def main(argv: list[str] | None = None) -> int:
     bus = Bus(DdsConfig(args.domain, args.interface, tuple(args.peer)))
     server = ServiceServer(bus, ids.VIDEO_SERVICE)
     waitset = bus.waitset(server.reader)
-    hub, alive, check_ns = VideoHub(server, render, report), input_is_open, _PARENT_CHECK_NS
+    view = PictureView(args.view_fd)
+    hub, alive, check_ns = VideoHub(server, render, report, view.show), input_is_open, _PARENT_CHECK_NS
     if args.faults:
         from sim_hil.protocols.unitree.camera_faults import FaultyVideoHub  # not loaded where no fault may be injected
 
         size, check_ns = (args.width, args.height), _FAULTS_CHECK_NS
-        hub = faulty = FaultyVideoHub(server, render, report, size=size, commands_fd=sys.stdin.fileno())
+        hub = faulty = FaultyVideoHub(server, render, report, view.show, size=size, commands_fd=sys.stdin.fileno())
         alive = faulty.listen
     # BrokenPipeError: the parent died between two looks at stdin.
     with contextlib.closing(world), contextlib.closing(poses), contextlib.suppress(BrokenPipeError):
@@ -74,6 +76,8 @@ def main(argv: list[str] | None = None) -> int:
         while alive():
             waitset.wait(check_ns)
             hub.serve()
+            if view.is_due:
+                hub.show_unasked()
     return 0
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 import dataclasses
+import gc
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -47,6 +49,34 @@ def test_the_next_frame_does_not_touch_the_tokens_of_the_last(policy: Policy) ->
     kept = first.copy()
     policy.encode(picture(2))
     np.testing.assert_array_equal(first, kept)
+
+
+class MallInfo(ctypes.Structure):
+    """`struct mallinfo2` of glibc, bytes."""
+
+    _fields_ = [
+        (name, ctypes.c_size_t)
+        for name in (
+            "arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks", "uordblks", "fordblks", "keepcost",
+        )
+    ]  # fmt: skip
+
+
+def test_ticks_keep_no_memory_and_ask_the_system_for_none(policy: Policy, artifacts: Artifacts) -> None:
+    libc = ctypes.CDLL(None)
+    if not hasattr(libc, "mallinfo2"):
+        pytest.skip("mallinfo2 needs glibc 2.33")
+    libc.mallinfo2.restype = MallInfo
+    state, frame, tokens = semantic(policy, artifacts, 1), picture(1), np.zeros(policy.tokens_shape, np.float32)
+
+    def memory_after(ticks: int) -> tuple[int, int]:
+        for _ in range(ticks):
+            policy.act(policy.encode(frame, tokens), (0.4, 0.0, 0.0), 1.0, HERE, state)
+        gc.collect()
+        info = libc.mallinfo2()
+        return info.uordblks // 4096, info.arena + info.hblkhd
+
+    assert memory_after(30) == memory_after(30)
 
 
 @pytest.mark.parametrize(

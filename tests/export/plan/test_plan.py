@@ -177,6 +177,20 @@ def test_the_counted_layers_are_the_layers_of_the_graphs(config: object) -> None
         assert counted == set(linear_layers(config, graph)) - ({"embed"} if graph[0] == "v" else set())
 
 
+@pytest.mark.parametrize("name", ["orin", "cpu"])
+def test_guesses_shorten_decoding_and_the_semantic_states_age_alike_and_are_tagged_modelled(name: str) -> None:
+    made = planned(name, tokens=40)
+    with_guesses = made.to_dict()["speculation"]
+    assert with_guesses["tagged"] == MODELLED and with_guesses["acceptance"] == 0.89
+    share = with_guesses["generation_alone_ms"] / made.generation_alone.ms
+    assert share < 1 and made.delay_s is not None
+    assert with_guesses["delay_s"] == pytest.approx(made.delay_s * share, rel=1e-3)
+
+
+def test_a_target_without_speculation_plans_none() -> None:
+    assert planned("orin", "runtime.speculation=off", tokens=40).to_dict()["speculation"] is None
+
+
 def test_counted_work_is_that_of_the_paper_size_model() -> None:
     """724 GFLOP an image, 839 a prompt of 1,100 tokens (counted independently when the runtimes were compared)."""
     assert vision_call(BIG).flops() == pytest.approx(724e9, rel=0.01)

@@ -82,3 +82,73 @@ def test_a_wrong_file_is_refused_in_one_line(tmp_path: Path, before: str, after:
     with pytest.raises(ConfigError) as error:
         load_robot_config(path)
     assert complaint in str(error.value) and "\n" not in str(error.value)
+
+
+def written(tmp_path: Path, robot: str, ros2: str) -> Path:
+    """A shipped robot file with further lines in its [ros2]."""
+    text, path = GO2_SIM.with_name(robot).read_text(), tmp_path / "robot.toml"
+    before, _, after = text.partition("\n[ros2]")
+    comment, _, after = after.partition("\n")
+    path.write_text(f"{before}\n[ros2]{comment}\n{ros2}\n{after}")
+    return path
+
+
+def test_nothing_is_published_unless_asked() -> None:
+    assert not load_robot_config(GO2_SIM).ros2_publish.publish
+
+
+def test_a_go2_publishes_on_its_own_network_unless_another_is_named(tmp_path: Path) -> None:
+    config = load_robot_config(written(tmp_path, "go2_sim.toml", "publish = true"))
+    assert config.ros2_publish.network(config.dds) == config.dds and config.ros2 is None
+    more = 'publish = true\npublish_interface = "wlan0"\npublish_domain = 7'
+    other = load_robot_config(written(tmp_path, "go2_sim.toml", more))
+    network = other.ros2_publish.network(other.dds)
+    assert (network.interface, network.domain, network.peers) == ("wlan0", 7, ())
+
+
+def test_a_robot_without_dds_names_the_interface(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"missing key ros2\.publish_interface"):
+        load_robot_config(written(tmp_path, "carter_can_sim.toml", "publish = true"))
+    config = load_robot_config(written(tmp_path, "carter_can_sim.toml", 'publish = true\npublish_interface = "lo"'))
+    assert config.ros2_publish.network(config.dds).domain == 0 and config.ros2 is None
+
+
+def test_the_topics_of_a_ros2_base_are_never_published_a_second_time(tmp_path: Path) -> None:
+    """The bridge would stop: a second publisher of its odometry is another robot or a forger."""
+    with pytest.raises(ConfigError, match=r"ros2\.publish_namespace: expected one that the base does not use"):
+        load_robot_config(written(tmp_path, "carter_ros2_sim.toml", "publish = true"))
+    path = written(tmp_path, "carter_ros2_sim.toml", 'publish = true\npublish_namespace = "/tic_vla"')
+    assert load_robot_config(path).ros2_publish.topic("odom") == "rt/tic_vla/odom"
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ('instruction = "instruction"', 'instruction = "/tic_vla/reasoning"'),
+        ('source = "ros2:/camera/image/compressed"', 'source = "ros2:/tic_vla/camera/image/compressed"'),
+    ],
+)
+def test_the_runner_never_reads_what_it_publishes(tmp_path: Path, before: str, after: str) -> None:
+    path = written(tmp_path, "carter_ros2_sim.toml", 'publish = true\npublish_namespace = "/tic_vla"')
+    assert before in path.read_text()
+    path.write_text(path.read_text().replace(before, after))
+    with pytest.raises(ConfigError, match=r"ros2\.publish_namespace: expected one that the base does not use"):
+        load_robot_config(path)
+
+
+@pytest.mark.parametrize(
+    ("lines", "complaint"),
+    [
+        ("publish = 1", "ros2.publish: expected bool, found 1"),
+        ('publish = true\nodometry = "o"', "unknown key ros2.odometry: protocol unitree has only ros2.publish"),
+        ('publish = true\npublish_namespace = "x"', "ros2.publish_namespace: expected"),
+        ("publish = true\npublish_domain = 233", "ros2.publish_domain: expected -1..232, found 233"),
+        ('publish = true\npublish_interface = "a<b"', "ros2.publish_interface: expected a name or an address"),
+        ("[ros2_publish]\npublish = true", "unknown key ros2_publish"),
+        ('command = "c"', "unknown key ros2.command: protocol unitree has only ros2.publish"),
+    ],
+)
+def test_a_wrong_key_of_publishing_is_refused_in_one_line(tmp_path: Path, lines: str, complaint: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        load_robot_config(written(tmp_path, "go2_sim.toml", lines))
+    assert complaint in str(error.value) and "\n" not in str(error.value)

@@ -67,7 +67,7 @@ class FakeRun:
         self.language.instructions.append(segments[0][1])
         self.language.caps.append(max_new_tokens)
         new = min(max_new_tokens, self.language.new_tokens)
-        return Generation(self.language.text, self.language.kv, (7,) * new, 4, 1.0, 1.0, new + 1, 0, 0)
+        return Generation(self.language.text, self.language.kv, (7,) * new, 4, 1.0, 1.0, (1,) * (new + 1), 0, 0)
 
 
 class FakeConstraint:

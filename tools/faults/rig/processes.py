@@ -47,6 +47,7 @@ _STEADY_MOVES = 10  # 0.2 s of the bridge's commands
 _STEADY_SHARE = 0.9
 _ATTEMPTS = 4
 _COMMANDER_S = 2.2
+_PERMIT_TIMEOUT_S = 4.0
 
 
 def _has_printed(child: Child, text: str) -> bool:
@@ -230,12 +231,19 @@ class Rig:
         self.bridge = None
 
     def _operator_arms(self) -> None:
-        """Permit the waiting runner to arm, as an operator does. Raises StepError."""
+        """Permit the waiting runner to arm, as an operator does, and again for a while. Raises StepError.
+
+        The bridge refuses for a second after the end of a pressed stop or of a person's driving.
+        """
         socket = str(self.folder / BRIDGE_SOCKET)
         command = [*COMMANDS["edge-bridge"], "arm", *self._link(), "--socket", socket]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
-        if done.returncode != 0:
-            raise StepError(f"edge-bridge arm: exit code {done.returncode}: {done.stderr.strip()}")
+        deadline_ns = time.monotonic_ns() + round(_PERMIT_TIMEOUT_S * 1e9)
+        while True:
+            done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
+            if done.returncode == 0:
+                return
+            if time.monotonic_ns() > deadline_ns:
+                raise StepError(f"edge-bridge arm: exit code {done.returncode}: {done.stderr.strip()}")
 
     def forget_runner(self) -> None:
         """Stop watching a runner that has ended."""

@@ -38,6 +38,7 @@ from sim_hil.protocols.ros2.topics import COMMAND_TOPIC
 _FIND_TIMEOUT_S = 10.0
 _SPEED_MPS = 0.2
 _RATE_HZ = 10.0
+_POLL_S = 0.001
 
 
 class NoRobotError(RuntimeError):
@@ -134,13 +135,14 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("address", help="DDS domain, multicast address of the CAN bus, or UDP port,KEY FILE")
     parser.add_argument("--duration", type=float, default=1.0, help="s (default: 1)")
     args = parser.parse_args(argv)
-    signal.pthread_sigmask(
-        signal.SIG_BLOCK, {signal.SIGUSR1}
-    )  # threads inherit the mask, so only sigwait receives the signal
+    begun: list[int] = []
+    # A handler, not sigwait: a library's thread, started before a mask could be set, would die of the signal.
+    signal.signal(signal.SIGUSR1, lambda number, _frame: begun.append(number))
     try:
         with COMMANDERS[args.protocol](args.address) as send:
             print("rogue: ready", flush=True)
-            signal.sigwait({signal.SIGUSR1})
+            while not begun:
+                time.sleep(_POLL_S)
             print(f"rogue: first {time.monotonic_ns()}", flush=True)
             for _ in range(max(1, round(args.duration * _RATE_HZ))):
                 send()

@@ -73,6 +73,64 @@ def test_a_wrong_profile_is_one_clear_line(tmp_path: Path, changed: dict[str, An
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
+CALLS = {"call_s": {"2": 0.1, "4": 0.2, "8": 0.3}, "rest_s": [1.0, 1.1, 1.2]}
+
+
+def test_a_profile_of_calls_survives_json() -> None:
+    made = LatencyProfile.of_json(profile(**CALLS))
+    assert made.call_s == ((2, 0.1), (4, 0.2), (8, 0.3))
+    assert LatencyProfile.of_json(json.loads(json.dumps(made.as_json()))) == made
+
+
+def test_a_profile_without_calls_is_written_as_before() -> None:
+    assert set(LatencyProfile.constant(2.0).as_json()) == {
+        "schema", "name", "source", "generation_s", "anchor_after_s", "tagged",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("call_tokens", "expected_s"),
+    [((), 0.0), ((1,), 0.1), ((1, 2, 3), 0.4), ((8, 5), 0.6), ((9,), 0.4), ((16,), 0.6)],
+)
+def test_a_call_takes_the_time_of_the_next_permitted_number_of_rows(
+    call_tokens: tuple[int, ...], expected_s: float
+) -> None:
+    assert LatencyProfile.of_json(profile(**CALLS)).decode_s(call_tokens) == pytest.approx(expected_s)
+
+
+def test_calls_are_counted_only_where_the_policy_asks_for_it() -> None:
+    made = LatencyProfile.of_json(profile(**CALLS))
+    whole, counted = (LatencySampler(made, 1, "a", by_calls=by_calls).draw() for by_calls in (False, True))
+    assert whole.total_ns in (4_500_000_000, 4_800_000_000, 5_100_000_000) and whole.decode_ns is None
+    assert counted.total_ns in (1_000_000_000, 1_100_000_000, 1_200_000_000)
+    assert counted.decode_ns is not None and counted.decode_ns((1, 8)) == 400_000_000
+
+
+def test_scaling_scales_the_calls_too() -> None:
+    scaled = LatencyProfile.of_json(profile(**CALLS)).scaled_to_mean(9.6)
+    assert scaled.decode_s((1, 8)) == pytest.approx(0.8) and scaled.rest_s == pytest.approx((2.0, 2.2, 2.4))
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"call_s": {"2": 0.1}}, "as many rest_s as generation_s, found 0"),
+        ({"rest_s": [1.0, 1.0, 1.0]}, "expected call_s to have calls"),
+        ({**CALLS, "call_s": {"4": 0.1}}, "expected call_s to have calls"),
+        ({**CALLS, "call_s": {"1": 0.1, "2": 0.1}}, "expected call_s to have calls"),
+        ({**CALLS, "call_s": {"2": 0.1, "17": 0.1}}, "expected call_s to have calls"),
+        ({**CALLS, "call_s": {"2": 0.0}}, "call_s above 0"),
+        ({**CALLS, "call_s": {"two": 0.1}}, "seconds by number of rows"),
+        ({**CALLS, "call_s": [0.1]}, "seconds by number of rows"),
+        ({**CALLS, "rest_s": [1.0, 1.0, 61.0]}, "rest_s from its anchor_after_s"),
+        ({**CALLS, "anchor_after_s": [1.5, 0.0, 0.0]}, "rest_s from its anchor_after_s"),
+    ],
+)
+def test_wrong_calls_are_one_clear_line(changed: dict[str, Any], message: str) -> None:
+    with pytest.raises(LatencyError, match=message):
+        LatencyProfile.of_json(profile(**changed))
+
+
 def test_a_profile_may_be_toml(tmp_path: Path) -> None:
     path = tmp_path / "profile.toml"
     path.write_text('schema = 1\nname = "n"\nsource = "s"\ngeneration_s = [1.0, 2]\n')

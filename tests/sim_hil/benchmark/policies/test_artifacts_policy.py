@@ -16,7 +16,9 @@ from edge.artifacts.manifest import Artifacts
 from edge.core.geometry import SE2
 from edge.flightlog.part import encode
 from edge.flightlog.schemas import SCHEMAS
+from edge.inference.language import LanguageModel
 from edge.reasoning.prompt import InstructionError
+from edge.state.switches import Speculation, SwitchOptions
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError, PolicySpec
 from sim_hil.benchmark.conditions.latency import LatencyProfile
 from sim_hil.benchmark.conditions.variants import VARIANTS, artifact_directory, check_variant
@@ -132,6 +134,70 @@ def test_without_reasoning_it_drives_without_a_text(policies: dict[str, Artifact
     rows = drive(policy, 6)
     assert [command != (0.0, 0.0, 0.0) for command, _ in rows] == [False, False, True, True, True, True]
     assert {record["new_tokens"] for record in policy.generations()} == {0} and rows[-1][1]["text"] == ""
+
+
+CALLS = LatencyProfile("n", "s", (1.0,), call_s=((2, 0.011), (4, 0.011), (16, 0.011)), rest_s=(0.1,))
+
+
+def by_calls(directory: Path, speculation: Speculation = Speculation.ON) -> ArtifactsPolicy:
+    switches = SwitchOptions(speculation=speculation)
+    return ArtifactsPolicy(directory, mode="async", latency=CALLS, robot=robot_config(), switches=switches)
+
+
+@pytest.fixture(scope="module")
+def guessing(artifacts_dir: Path) -> ArtifactsPolicy:
+    """A policy whose latency depends on the calls of its texts."""
+    return by_calls(artifacts_dir)
+
+
+def test_a_generation_takes_the_time_of_the_calls_that_its_text_takes(guessing: ArtifactsPolicy) -> None:
+    drive(guessing, 12)
+    records = guessing.generations()
+    assert records
+    for record in records:
+        due_s = record["started_s"] + 0.1 + CALLS.decode_s(record["call_tokens"][1:])
+        assert due_s - 1e-6 <= record["released_s"] <= due_s + 0.1
+
+
+@pytest.mark.slow
+def test_without_guesses_each_token_of_the_same_text_costs_a_call(
+    artifacts_dir: Path, guessing: ArtifactsPolicy
+) -> None:
+    plain = by_calls(artifacts_dir, Speculation.OFF)
+    for policy in (plain, guessing):
+        drive(policy, 12)
+    expected, found = plain.generations()[0], guessing.generations()[0]
+    assert found["text"] == expected["text"] and max(found["call_tokens"]) > 1
+    assert expected["call_tokens"] == (1,) * len(expected["call_tokens"])
+    assert expected["new_tokens"] <= len(expected["call_tokens"]) <= expected["new_tokens"] + 1
+
+
+def test_the_same_episode_takes_the_same_calls_whatever_was_driven_before(guessing: ArtifactsPolicy) -> None:
+    drive(guessing, 12)
+    first = guessing.generations()
+    drive(guessing, 12, seed=2)
+    drive(guessing, 12)
+    assert guessing.generations() == first
+
+
+def test_a_device_that_guesses_nothing_takes_one_call_a_token(
+    guessing: ArtifactsPolicy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(guessing, "_latency", replace(CALLS, call_s=((1, 0.01),)))
+    drive(guessing, 12)
+    assert {tokens for record in guessing.generations() for tokens in record["call_tokens"]} == {1}
+
+
+def test_more_rows_than_this_machine_computes_exactly_are_refused(
+    artifacts_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(model: LanguageModel) -> str:
+        model.rows = (1,)
+        return "no equal bits"
+
+    monkeypatch.setattr(LanguageModel, "speculate", refuse)
+    with pytest.raises(ArtifactError, match="up to 16 rows, this machine computes at most 1"):
+        by_calls(artifacts_dir)
 
 
 def test_generations_have_times_of_the_episode(policies: dict[str, ArtifactsPolicy]) -> None:

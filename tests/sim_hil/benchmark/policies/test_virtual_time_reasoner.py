@@ -19,7 +19,8 @@ TICK_NS = 100_000_000
 class Bench:
     """Ticks of 0.1 s from 1 s on: a frame each, the robot 0.05 m further in every one in which it may drive.
 
-    `coasting`: by how much further in each of the ticks after a halt, m.
+    `coasting`: by how much further in each of the ticks after a halt, m. `call_s`: duration of each decoding call
+    after the first token, s.
     """
 
     def __init__(
@@ -29,11 +30,13 @@ class Bench:
         mode: Mode = Mode.ASYNC,
         anchor_after_s: float = 0.0,
         coasting: tuple[float, ...] = (),
+        call_s: float | None = None,
     ) -> None:
         self.x_m, self.coasting, self.left = 0.0, coasting, ()
         self.language, self.policy = FakeLanguage(), FakePolicy()
         self.ring, self.slot, self.tick = TokenRing(160), SemanticSlot(), 0
-        timing = Timing(round(latency_s * 1e9), round(anchor_after_s * 1e9))
+        decode_ns = None if call_s is None else lambda call_tokens: round(call_s * 1e9) * len(call_tokens)
+        timing = Timing(round(latency_s * 1e9), round(anchor_after_s * 1e9), decode_ns)
         self.reasoner = VirtualTimeReasoner(
             GenerationModels(self.language, self.policy),  # type: ignore[arg-type]
             SharedState(self.ring, self.slot),
@@ -83,6 +86,29 @@ def test_a_late_newest_frame_shortens_the_delay_and_not_the_generation() -> None
     bench.run(6.0)
     assert next(row for row in bench.seen if row[1] == 0) == (3.0, 0, 2.0)
     assert next(row for row in bench.seen if row[1] == 1) == (6.0, 1, 2.0)
+
+
+@pytest.mark.parametrize(("new_tokens", "there_s"), [(0, 1.0), (1, 1.3), (3, 1.9)])
+def test_the_calls_after_the_first_token_add_to_the_latency(new_tokens: int, there_s: float) -> None:
+    bench = Bench(1.0, call_s=0.3)
+    bench.language.new_tokens = new_tokens
+    bench.run(2.5)
+    assert next(time_s for time_s, generation, _ in bench.seen if generation == 0) == there_s
+
+
+def test_counting_calls_changes_when_a_generation_is_released_and_not_what_it_reads() -> None:
+    counted, drawn = Bench(1.0, anchor_after_s=0.4, call_s=0.3), Bench(1.9, anchor_after_s=0.4)
+    for bench in (counted, drawn):
+        bench.run(8.0)
+    assert counted.reasoner.released == drawn.reasoner.released and counted.seen == drawn.seen
+    assert counted.language.prompts[: len(drawn.language.prompts)] == drawn.language.prompts
+
+
+def test_a_failure_of_a_generation_whose_calls_are_counted_does_not_end_reasoning() -> None:
+    bench = Bench(1.0, call_s=0.1)
+    bench.language.broken = 1
+    bench.run(4.0)
+    assert bench.reasoner.cycle.failed == 1 and bench.reasoner.released
 
 
 def test_sync_anchors_where_the_robot_has_come_to_stand() -> None:

@@ -13,6 +13,7 @@ from edge.core.geometry import SE2
 from edge.flightlog.explain.flight import read_flight
 from edge.flightlog.standard_messages import jpeg_size
 from sim_hil.benchmark.env.metrics import Outcome
+from sim_hil.benchmark.results.causes import cause_counts, cause_tables, keep_cause, read_causes
 from sim_hil.benchmark.results.failures import cause_table, counts, failure_sheet, failures
 from sim_hil.benchmark.results.flight import EpisodeFlight
 from sim_hil.scene.scene import load_scene
@@ -87,3 +88,35 @@ def test_an_episodes_log_has_the_truth_with_the_path_to_the_goal(tmp_path: Path)
     assert truth.people == ((3.0, 0.0),), "those within 10 m"
     assert truth.route_m == pytest.approx(12.0, abs=0.5) and abs(truth.route_bearing_rad or 9.0) < 0.3
     assert [path.name for path in (tmp_path / "flights").iterdir()] == ["a.mcap"]
+
+
+def test_of_a_failure_its_cause_alone_can_be_kept(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "flights").mkdir()
+    for name in ("a", "c"):
+        log = tmp_path / "flights" / f"{name}.mcap"
+        log.write_bytes((run / "flights" / f"{name}.mcap").read_bytes())
+        keep_cause(log, tmp_path)
+    found = read_causes(tmp_path, RESULTS)
+    assert {name: cause for name, (cause, _) in found.items()} == {"a": "command limited", "c": "action expert"}
+    assert not list((tmp_path / "flights").iterdir())
+    counted = cause_counts(RESULTS, found)
+    assert counted["all"] == {"missed": {"command limited": 1}, "collided": {"action expert": 1}}
+    assert counted["by_scene"] == {"corridor": counted["all"]}
+
+
+def test_a_log_that_cannot_be_read_is_an_unexplained_failure(run: Path, tmp_path: Path) -> None:
+    log = tmp_path / "a.mcap"
+    log.write_bytes((run / "flights" / "a.mcap").read_bytes()[:100])
+    keep_cause(log, tmp_path)
+    assert read_causes(tmp_path, RESULTS) == {"a": ("unexplained", "")}
+
+
+def test_causes_are_counted_in_the_groups_of_the_rates() -> None:
+    causes = {"a": ("reasoning text", "it turns too late"), "b": ("odometry", "it drifts"), "c": ("person", "it came")}
+    by_group, reasons = cause_tables(RESULTS, causes)
+    assert by_group.head == ("group", "goal missed", "reasoning text", "odometry", "person", "only collided")
+    assert tuple(by_group.rows[0]) == ("all", "2", "1", "1", "0", "1")
+    assert {tuple(row) for row in reasons.rows} >= {
+        ("person", "it came", "0", "1"),
+        ("odometry", "it drifts", "1", "0"),
+    }

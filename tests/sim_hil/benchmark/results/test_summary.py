@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from sim_hil.benchmark.results.bootstrap import mean_ci95, paired_ci95
 from sim_hil.benchmark.results.record import FailedRun, ResultError
 from sim_hil.benchmark.results.store import ResultStore
 from sim_hil.benchmark.results.summary import compare, summarise
+from sim_hil.benchmark.workers.progress import BenchProgress
 from tests.support.benchmark import dynanav_fakes as fakes
 
 
@@ -48,6 +50,12 @@ def test_the_interval_is_about_that_of_the_normal_approximation() -> None:
     low, high = mean_ci95([100.0] * 47 + [0.0] * 38, each_its_own(85)) or (0.0, 0.0)
     half = 1.96 * np.sqrt(47 / 85 * 38 / 85 / 85) * 100
     assert high - low == pytest.approx(2 * half, rel=0.05)
+
+
+def test_a_rate_over_tasks_of_one_episode_has_wilsons_interval() -> None:
+    # Wilson (1927) of 15 in 50, as statsmodels.stats.proportion.proportion_confint(15, 50, method="wilson") gives it.
+    interval = mean_ci95([100.0] * 15 + [0.0] * 35, each_its_own(50), (0.0, 100.0))
+    assert interval == pytest.approx((19.103, 43.751), abs=0.01)
 
 
 def test_one_episode_has_no_interval_and_none_has_no_rate() -> None:
@@ -122,6 +130,29 @@ def test_a_difference_whose_interval_holds_zero_is_not_called_significant() -> N
     assert not one["significant"] and one["ci95"][0] == 0
 
 
+def fresh(task: str, **changed: object) -> fakes.EpisodeResult:
+    make = fakes.result if changed.pop("reached", True) else fakes.missed
+    return make(f"{task}-0-go2", task=task, scene="-".join(task.split("-")[:2]), **changed)
+
+
+FRESH = [
+    fresh("office-60-1-turn-desk-1", shortest_m=8.0),
+    fresh("office-61-2-turns-coffee-machine-2", shortest_m=13.0, reached=False),
+    fresh("hospital-60-3-turns-bench-1", shortest_m=20.0, collided=True, collisions=("person",)),
+]
+
+
+def test_a_stratified_suite_is_summarised_by_kind_length_and_turns() -> None:
+    summary = summarise(FRESH)
+    assert {key: each["episodes"] for key, each in summary["by_scene"].items()} == {"hospital": 1, "office": 2}
+    assert list(summary["by_length"]) == ["short", "middle", "long"] and list(summary["by_turns"]) == ["1", "2", "3"]
+    assert summary["by_length"]["middle"]["sr"] == 0 and summary["by_turns"]["3"]["cr"] == 100
+
+
+def test_another_suite_has_no_strata() -> None:
+    assert not {"by_length", "by_turns"} & set(summarise([*FRESH, fakes.result("a")]))
+
+
 def run_of(folder: Path, results: list[fakes.EpisodeResult], suite: str = "dynanav") -> Path:
     config = {"suite": suite, "conditions": fakes.STILL.as_json(), "episodes": []}
     config |= {"suite_sha256": "0" * 64, "versions": {}}
@@ -137,6 +168,22 @@ def test_compare_prints_both_runs_and_their_difference(tmp_path: Path, capsys: p
     assert cli.main(["compare", str(a), str(b)]) == 0
     message = capsys.readouterr().out
     assert "2 episodes in both" in message and "+100.00" in message and "succeeded in B only: e1, e3" in message
+
+
+def test_no_output_about_the_fresh_suite_names_an_episode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    a = run_of(tmp_path / "a", FRESH, suite="dynanav-fresh")
+    b = run_of(tmp_path / "b", [replace(FRESH[0], success=False, spl=0.0)], suite="dynanav-fresh")
+    assert cli.main(["compare", str(a), str(b)]) == 0
+    message = capsys.readouterr().out
+    assert "succeeded in A only: 1" in message
+    assert cli.main(["report", str(a)]) == 0
+    html = (a / "report.html").read_text()
+    BenchProgress(2, 0, blind=True).watcher.finished(FRESH[0])
+    message += (seen := capsys.readouterr().err)
+    assert "[1/2] 9 s simulated" in seen
+    assert "length: middle" in html and "turns: 3" in html
+    for each in FRESH:
+        assert each.id not in message + html and each.scene not in message + html
 
 
 @pytest.mark.parametrize("other", ["nowhere", "another-suite", "other-episodes", "changed-episode"])

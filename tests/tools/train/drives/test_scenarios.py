@@ -45,7 +45,7 @@ def test_no_training_scene_has_the_content_of_a_benchmark_scene() -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("seed", [0, 3, 99])
+@pytest.mark.parametrize("seed", [0, 3, 60, 99])
 def test_a_reserved_layout_is_refused(kind: str, seed: int) -> None:
     with pytest.raises((SiteError, LayoutError), match="benchmark"):
         Site(kind, seed)

@@ -80,7 +80,7 @@ class Listener:
     def finish(self, segments: Sequence[Segment], *, max_new_tokens: int, constraint: TextConstraint) -> Generation:
         self.feed(segments)
         text = self.says[len(self.heard) - 1]
-        return Generation(text, np.zeros((1, 1, 4), np.float32), (), len(self.heard[-1]), 0.0, 0.0, 0, 0, 0)
+        return Generation(text, np.zeros((1, 1, 4), np.float32), (), len(self.heard[-1]), 0.0, 0.0, (), 0, 0)
 
 
 class NoPolicy:

@@ -15,7 +15,8 @@ import aiohttp
 import psutil
 import pytest
 
-from edge.live.feed import LiveError, LiveFeed, LiveOptions
+from edge.live.feed import LiveFeed
+from edge.live.options import LiveError, LiveOptions
 
 pytestmark = pytest.mark.process
 
