@@ -66,13 +66,11 @@ def _loaded(module: types.ModuleType, tree: ast.Module) -> types.ModuleType:
 
 def _function(member: Any) -> types.FunctionType:
     """The function behind a property, a class or static method, and decorators that name what they wrap."""
-    while not isinstance(member, types.FunctionType) or hasattr(member, "__wrapped__"):
+    while hasattr(member, "__wrapped__") or not isinstance(member, types.FunctionType):
         if isinstance(member, property):
             member = member.fget
-        elif hasattr(member, "__wrapped__"):
-            member = member.__wrapped__
         else:
-            member = member.__func__
+            member = getattr(member, "__wrapped__", None) or getattr(member, "__func__")  # noqa: B009 - of any type
     return member
 
 

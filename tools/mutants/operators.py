@@ -42,13 +42,15 @@ class Mutant:
     """One change of a module. `key` names function, statement and change, and survives a move within the file.
 
     `place`: names of the classes and the function around the change, from outside inwards; a function inside a
-    function counts as a part of it. `line`: its line in the file. `change` makes the change and returns the module's
-    tree; it may be called once, and of all mutants of one `mutants_of` for one only.
+    function counts as a part of it. `line`: its line in the file. `span`: first and last line of the function or class.
+    `change` makes the change and returns the module's tree; it may be called once, and of all mutants of one
+    `mutants_of` for one only.
     """
 
     key: str
     place: tuple[str, ...]
     line: int
+    span: tuple[int, int]
     change: Callable[[], ast.Module]
 
 
@@ -57,20 +59,21 @@ def mutants_of(source: str) -> list[Mutant]:
     tree = ast.parse(source)
     seen: Counter[str] = Counter()
     mutants = []
-    for site in _inside(tree, (), "", in_function=False):
+    for site in _inside(tree, (), (0, 0), "", in_function=False):
         before, after = ast.unparse(site.child), _first_line(site.replacement)
         place = ".".join(site.place) or "<module>"
         statement = "" if site.statement == _short(before) else f"{site.statement} | "
         key = f"{place} | {statement}{_short(before)} -> {_short(after)}"
         seen[key] += 1
         key = key if seen[key] == 1 else f"{key} #{seen[key]}"
-        mutants.append(Mutant(key, site.place, site.line, functools.partial(_changed, tree, site)))
+        mutants.append(Mutant(key, site.place, site.line, site.span, functools.partial(_changed, tree, site)))
     return mutants
 
 
 @dataclass(frozen=True)
 class _Site:
     place: tuple[str, ...]
+    span: tuple[int, int]
     statement: str
     parent: ast.AST
     field: str
@@ -103,7 +106,9 @@ def _short(text: str) -> str:
     return line if len(line) <= 70 else f"{line[:45]} ... {line[-20:]}"
 
 
-def _inside(node: ast.AST, place: tuple[str, ...], statement: str, *, in_function: bool) -> Iterator[_Site]:
+def _inside(
+    node: ast.AST, place: tuple[str, ...], span: tuple[int, int], statement: str, *, in_function: bool
+) -> Iterator[_Site]:
     """Every possible change below a node, always in the same order."""
     for name, value in ast.iter_fields(node):
         if name in ("annotation", "returns", "decorator_list", "type_params", "bases"):
@@ -113,14 +118,15 @@ def _inside(node: ast.AST, place: tuple[str, ...], statement: str, *, in_functio
                 continue
             if _is_docstring(child):
                 continue
-            inner, function = place, in_function
+            inner, within, function = place, span, in_function
             if isinstance(child, (ast.FunctionDef, ast.ClassDef)) and not in_function:
                 inner, function = (*place, child.name), isinstance(child, ast.FunctionDef)
+                within = (child.lineno, child.end_lineno or child.lineno)
             text = _short(ast.unparse(child)) if isinstance(child, ast.stmt) else statement
             for replacement in _replacements(child, node):
-                yield _Site(inner, text, node, name, position, child, replacement)
+                yield _Site(inner, within, text, node, name, position, child, replacement)
             if not isinstance(child, ast.Raise):  # what it raises is a message
-                yield from _inside(child, inner, text, in_function=function)
+                yield from _inside(child, inner, within, text, in_function=function)
 
 
 def _is_docstring(node: ast.AST) -> bool:

@@ -67,9 +67,11 @@ class MutantSession:
             if time.monotonic_ns() > self.deadline_ns:
                 self.unfinished += 1
                 continue
-            # A line outside functions runs at the import: every test may depend on it.
-            chosen = [test for test in tests if mutant.line in test.lines or not _in_function(target, mutant)]
-            if not chosen and mutant.line not in reached:
+            chosen = [test for test in tests if mutant.line in test.lines]
+            if mutant.line not in reached:  # run at the import: constants, and defaults of arguments
+                inside = range(mutant.span[0], mutant.span[1] + 1) if _in_function(target, mutant) else None
+                chosen = [test for test in tests if inside is None or not test.lines.isdisjoint(inside)]
+            if not chosen:
                 self.report(mutant.key, UNREACHED)
                 continue
             chosen.sort(key=lambda test: test.took_s)

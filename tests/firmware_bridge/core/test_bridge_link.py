@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from firmware_bridge.core.link import (
     CAUSES,
     MAX_DATAGRAM_BYTES,
+    MAX_REASON_BYTES,
     MOTIONS,
     PERMITS,
     STATES,
@@ -26,6 +27,7 @@ from firmware_bridge.core.link import (
     decode,
     encode,
 )
+from firmware_bridge.core.robot_state import BatteryState, RobotState
 
 i64 = st.integers(-(2**63), 2**63 - 1)
 u64 = st.integers(0, 2**64 - 1)
@@ -107,6 +109,31 @@ def test_any_kind_with_a_body_of_any_length_is_a_message_or_a_link_error(kind: i
     body = bytes(max(length + more, 0))
     with contextlib.suppress(LinkError):
         assert encode(decode(struct.pack("<4sBBH", b"TVEB", VERSION, kind, len(body)) + body))[5] == kind
+
+
+def test_kinds_layout_and_size_are_those_of_version_3() -> None:
+    zero = (0.0, 0.0, 0.0)
+    state = RobotState(1, zero, 0.0, 0.0, 0.0, 2, 3, 4, 0.0, 0.0, 0.0, 0.0, (5, 6, 7, 8))
+    status = BridgeStatus(9, "stopped", "why", 1, 2, 3, zero, True, "client_stop", "estop", "given", "moving", 0.5)
+    heads = [encode(message)[:8].hex() for message in (Arm(), Stop(), Velocity(1, 2, 0, 0, 0), status, Release())]
+    heads += [encode(message)[:8].hex() for message in (state, BatteryState(1, 80, 29.0, 1.0))]
+    assert heads == [
+        *("5456454203010000", "5456454203020000", "5456454203032800", "5456454203044900"),
+        *("5456454203050000", "5456454203068000", "5456454203072000"),
+    ]
+    assert encode(Velocity(1, 2, 0.5, 0.0, 0.0))[8:] == struct.pack("<Qq3d", 1, 2, 0.5, 0, 0)
+    assert encode(status)[8:22] == struct.pack("<q6B", 9, 3, 1, 1, 6, 2, 2)
+    assert (MAX_DATAGRAM_BYTES, MAX_REASON_BYTES) == (512, 400)
+
+
+def test_a_cause_keeps_its_number_within_a_version() -> None:
+    assert (
+        *("none", "client_stop", "client_lost", "deadman", "shutdown", "suspended", "estop", "remote_takeover"),
+        *("second_commander", "second_publisher", "link_down", "state_silent", "wrong_mode", "robot_error", "tipped"),
+        *("robot_moving", "not_standing", "battery_low", "wrong_robot", "operator", "unsafe_robot"),
+    ) == CAUSES
+    assert STATES == ("disarmed", "arming", "armed", "stopped")
+    assert (PERMITS, MOTIONS) == (("not needed", "needed", "given"), ("unknown", "still", "moving"))
 
 
 def test_a_status_without_a_report_of_the_robot_says_so() -> None:
