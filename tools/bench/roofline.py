@@ -142,7 +142,7 @@ def assumption(target: Target, stage: StageTime) -> str:
         name, figure = "memory_efficiency", roofline.memory_efficiency
     else:
         name, figure = f"compute_efficiency.{stage.stage}", roofline.compute_efficiency[stage.stage]
-    return f"{target.name}: {name} = {figure.value:g} ({figure.source})"
+    return f"{name} = {figure.value:g} ({figure.source})"
 
 
 @dataclass(frozen=True)
@@ -164,9 +164,13 @@ def intervals(residuals: Sequence[Residual]) -> dict[str, Interval]:
     return found
 
 
-def worst(residuals: Sequence[Residual]) -> Residual:
-    """Return the counted residual that is furthest from 1. Raises ValueError without one."""
-    return max((r for r in residuals if r.measurement.kind in COUNTED), key=lambda r: abs(math.log(r.ratio)))
+def worst(residuals: Sequence[Residual]) -> dict[str, Residual]:
+    """Return by target the counted residual that is furthest from 1."""
+    found: dict[str, Residual] = {}
+    for r in sorted(residuals, key=lambda r: abs(math.log(r.ratio))):
+        if r.measurement.kind in COUNTED:
+            found[r.measurement.target] = r
+    return found
 
 
 def predictions(by_bound: Mapping[str, Interval]) -> list[dict[str, Any]]:
@@ -194,8 +198,11 @@ def markdown(residuals: Sequence[Residual], by_bound: Mapping[str, Interval], ma
             f"| {r.measurement.name} | {r.measurement.kind} | {r.bound} | {r.measurement.measured_ms:.4g} | "
             f"{r.predicted.ms:.4g}{error} | {r.ratio:.2f}{'' if r.inside else ' (outside)'} |"
         )
-    furthest = worst(residuals)
-    lines += ["", f"Worst assumption: {furthest.assumption}; {furthest.measurement.name}: ratio {furthest.ratio:.2f}."]
+    lines += [""]
+    lines += [
+        f"Worst assumption of {target}: {r.assumption}; {r.measurement.name}: ratio {r.ratio:.2f}."
+        for target, r in worst(residuals).items()
+    ]
     lines += [f"Interval, {b} bound: {i.low:.2f} to {i.high:.2f} ({i.count} rows)." for b, i in by_bound.items()]
     lines += ["", "| prediction (modelled) | ms | interval, ms |", "|---|---:|---|"]
     lines += [
@@ -220,7 +227,7 @@ def main(argv: list[str] | None = None) -> int:
         result = {
             "residuals": [r.to_dict() for r in residuals],
             "intervals": {bound: asdict(interval) for bound, interval in by_bound.items()},
-            "worst": worst(residuals).to_dict(),
+            "worst": {target: r.to_dict() for target, r in worst(residuals).items()},
             "predictions": made,
             "tagged": MODELLED,
         }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import onnxruntime as ort
 import pytest
@@ -61,6 +63,28 @@ def test_a_provider_that_does_not_load_is_refused_and_not_silently_the_cpu(
         pytest.raises(ArtifactError, match="on CPUExecutionProvider instead of CUDAExecutionProvider"),
     ):
         Graph(artifacts, "action_expert", threads=1, provider="CUDAExecutionProvider")
+
+
+def test_openvino_gets_the_graphs_threads_and_leaves_no_node_to_another_provider(
+    artifacts: Artifacts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[tuple[str, dict[str, str], str]] = []
+
+    def open_session(_model: bytes, *, sess_options: ort.SessionOptions, providers: list[Any]) -> None:
+        (name, options), key = providers[0], "session.disable_cpu_ep_fallback"
+        seen.append((name, options, sess_options.get_session_config_entry(key)))
+        raise RuntimeError("not here")
+
+    monkeypatch.setattr(ort, "get_available_providers", lambda: ["OpenVINOExecutionProvider"])
+    monkeypatch.setattr(ort, "InferenceSession", open_session)
+    with pytest.raises(ArtifactError, match="not here"):
+        Graph(artifacts, "action_expert", threads=2, provider="OpenVINOExecutionProvider")
+    assert seen == [("OpenVINOExecutionProvider", {"num_of_threads": "2"}, "1")]
+
+
+def test_openvino_is_refused_on_a_machine_without_it(artifacts: Artifacts) -> None:
+    with pytest.raises(ArtifactError, match="made for OpenVINOExecutionProvider, this ONNX Runtime has"):
+        Graph(artifacts, "action_expert", provider="OpenVINOExecutionProvider")
 
 
 def test_the_gate_runs_on_the_cpu_where_the_shipping_provider_does_not_load(monkeypatch: pytest.MonkeyPatch) -> None:

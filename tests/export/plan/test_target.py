@@ -231,3 +231,12 @@ def test_an_engine_gets_a_profile_for_every_free_axis_and_only_what_it_can_run()
         with_settings(load_target("orin"), ["graphs.action_expert.precision=int4-b32"])
     with pytest.raises(TargetError, match="TensorrtExecutionProvider takes plain"):
         with_settings(load_target("orin"), ["graphs.action_expert.form=fused"])
+
+
+def test_the_encoder_may_run_on_openvino_in_the_form_that_it_reads() -> None:
+    setting = "graphs.vision_encoder.provider=openvino"
+    made = with_settings(load_target("cpu", "1b"), [setting, "graphs.vision_encoder.form=plain"])
+    assert made.provider("vision_encoder").name == "OpenVINOExecutionProvider"
+    assert not made.provider("vision_encoder").engine
+    with pytest.raises(TargetError, match="OpenVINOExecutionProvider takes plain"):
+        with_settings(load_target("cpu", "1b"), [setting])

@@ -52,7 +52,7 @@ def test_a_fitted_row_and_other_software_change_no_interval() -> None:
 
 def test_the_worst_assumption_is_that_of_the_furthest_counted_ratio() -> None:
     rows = [predict(replace(DECODE, tokens_per_s=rate), PRESETS["1b"]) for rate in (90.0, 1.0)]
-    found = worst(rows)
+    found = worst(rows)["orin"]
     assert found.measurement.tokens_per_s == 1.0 and "memory_efficiency = 0.6" in found.assumption
 
 
