@@ -107,7 +107,7 @@ class RobotConfig:
             needed, given = table in LINKS[self.protocol], getattr(self, table) is not None
             require(given or not needed, f"missing table [{table}]; protocol {self.protocol} needs it")
             require(needed or not given, f"unexpected table [{table}]; protocol {self.protocol} does not use it")
-        self.ros2_publish.check(self.dds, self.ros2)
+        self.ros2_publish.check(self.dds, self.ros2, self.camera.source)
         self.camera.check_protocol(self.protocol)
         unasked = self.safety.battery_min_percent == 0
         charge_known = self.ros2 is None or self.ros2.battery != "" or unasked

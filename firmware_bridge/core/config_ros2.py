@@ -133,18 +133,22 @@ class Ros2PublishConfig(Section):
                 raise ConfigError(f"ros2.publish_interface: expected a name or an address, found {found!r}") from None
         return dds if self.publish_domain == _OF_DDS else replace(dds, domain=self.publish_domain)
 
-    def check(self, dds: DdsConfig | None, base: Ros2Config | None) -> None:
-        """Check what other tables decide: a network, and no topic of the base. Raises ConfigError."""
+    def check(self, dds: DdsConfig | None, base: Ros2Config | None, camera: str) -> None:
+        """Check what other tables decide: a network, and no topic that base, bridge or runner use already.
+
+        `camera`: camera.source. Raises ConfigError.
+        """
         if not self.publish:
             return
         self.network(dds)
         if base is not None:
-            used = {base.topic(name) for name in (base.odometry, base.command, base.imu, base.battery) if name}
+            names = (base.odometry, base.command, base.imu, base.battery, base.instruction)
+            used = {base.topic(name) for name in names if name} | {dds_topic(camera.partition(":")[2] or "/")}
             own = self.publish_namespace != base.namespace and used.isdisjoint(map(self.topic, PUBLISHED))
             require(
                 own,
                 'ros2.publish_namespace: expected one that the base does not use, such as "/tic_vla", found'
-                f" {self.publish_namespace!r}: the bridge stops on a second publisher of the base's topics",
+                f" {self.publish_namespace!r}: the bridge stops on a second publisher of a topic that it reads",
             )
 
 

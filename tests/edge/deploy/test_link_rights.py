@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from ipaddress import IPv4Network
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,6 +16,7 @@ from edge.deploy.unit_check import check_units
 from edge.deploy.unit_text import UnitError
 from edge.deploy.units import BRIDGE_UNIT, FIREWALL_UNIT, RUNNER_UNIT, ServiceInputs, bridge_unit, runner_unit
 from firmware_bridge.core.config import load_robot_config
+from firmware_bridge.core.config_ros2 import Ros2PublishConfig
 from tests.edge.deploy.test_units import inputs, settings
 from tests.support.processes import GO2_SIM
 
@@ -30,6 +32,7 @@ def robot(
         can=SimpleNamespace(interface=can, channel=channel, bitrate_bps=500_000) if can else None,
         mavlink=SimpleNamespace(link=mavlink, signing_key=key) if mavlink else None,
         camera=SimpleNamespace(source=source),
+        ros2_publish=Ros2PublishConfig(),
     )
 
 
@@ -48,6 +51,17 @@ def units_of(of: Any) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
 
 def test_a_go2_keeps_the_rights_that_it_had() -> None:
     assert link_rights(load_robot_config(GO2_SIM)) == LinkRights()
+
+
+@pytest.mark.parametrize("interface", ["", "lo", "wlan0"])
+def test_a_service_publishes_on_the_network_of_its_robot_alone(interface: str) -> None:
+    go2 = load_robot_config(GO2_SIM)
+    publishing = replace(go2, ros2_publish=Ros2PublishConfig(publish=True, publish_interface=interface))
+    if interface == "wlan0":
+        with pytest.raises(UnitError, match=r"ros2\.publish_interface: a service reaches the robot's network alone"):
+            link_rights(publishing)
+    else:
+        assert link_rights(publishing) == link_rights(go2)
 
 
 def test_a_socketcan_bridge_gets_its_socket_family_and_no_network() -> None:

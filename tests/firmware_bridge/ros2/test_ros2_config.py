@@ -122,6 +122,21 @@ def test_the_topics_of_a_ros2_base_are_never_published_a_second_time(tmp_path: P
 
 
 @pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ('instruction = "instruction"', 'instruction = "/tic_vla/reasoning"'),
+        ('source = "ros2:/camera/image/compressed"', 'source = "ros2:/tic_vla/camera/image/compressed"'),
+    ],
+)
+def test_the_runner_never_reads_what_it_publishes(tmp_path: Path, before: str, after: str) -> None:
+    path = written(tmp_path, "carter_ros2_sim.toml", 'publish = true\npublish_namespace = "/tic_vla"')
+    assert before in path.read_text()
+    path.write_text(path.read_text().replace(before, after))
+    with pytest.raises(ConfigError, match=r"ros2\.publish_namespace: expected one that the base does not use"):
+        load_robot_config(path)
+
+
+@pytest.mark.parametrize(
     ("lines", "complaint"),
     [
         ("publish = 1", "ros2.publish: expected bool, found 1"),

@@ -26,20 +26,19 @@ pytestmark = [
 MOUNT = {"hfov_deg": 100.0, "height_m": 0.4, "pitch_deg": 2.0, "forward_m": 0.3}
 PATH_PX = 40
 """Pixels of the map's dark colours that a drawn robot and path have at least."""
-WAYPOINTS = """(() => {
-  const c = document.getElementById("picture"), d = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
+COUNT = """((id, wanted) => {
+  const seen = document.getElementById(id), copy = document.createElement("canvas");
+  [copy.width, copy.height] = [seen.width, seen.height];
+  const g = copy.getContext("2d", { willReadFrequently: true });
+  g.drawImage(seen, 0, 0);
+  const d = g.getImageData(0, 0, copy.width, copy.height).data;
   let n = 0;
-  for (let i = 0; i < d.length; i += 4) if (d[i] > 200 && d[i + 1] > 110 && d[i + 1] < 170 && d[i + 2] < 60) n++;
-  return n;
-})()"""
-"""Number of the picture's orange pixels."""
-COLOURED = """(id => {
-  const c = document.getElementById(id), d = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
-  let n = 0;
-  for (let i = 0; i < d.length; i += 4) if (d[i + 3] > 0 && (d[i] !== d[i + 1] || d[i + 1] !== d[i + 2])) n++;
+  for (let i = 0; i < d.length; i += 4) if (d[i + 3] > 0 && wanted(d[i], d[i + 1], d[i + 2])) n++;
   return n;
 })"""
-"""Number of a canvas's pixels that are drawn and not grey."""
+"""Number of a canvas's drawn pixels of a colour."""
+COLOURED = "(r, g, b) => r !== g || g !== b"
+ORANGE = "(r, g, b) => r > 200 && g > 110 && g < 170 && b < 60"
 
 
 class Drive:
@@ -105,10 +104,10 @@ def chromium(tmp_path: Path) -> Iterator[Chromium]:
 
 async def drawn(page: Page) -> None:
     await page.until('document.getElementById("link").textContent === "live"')
-    await page.until(f'{COLOURED}("picture") > 50000')
-    await page.until(f"{WAYPOINTS} > 50")
-    await page.until(f'{COLOURED}("map") > {PATH_PX}')
-    await page.until(f'{COLOURED}("plots") > 200')
+    await page.until(f'{COUNT}("picture", {COLOURED}) > 50000')
+    await page.until(f'{COUNT}("picture", {ORANGE}) > 50')
+    await page.until(f'{COUNT}("map", {COLOURED}) > {PATH_PX}')
+    await page.until(f'{COUNT}("plots", {COLOURED}) > 200')
 
 
 @pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
