@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from edge.artifacts.files import ArtifactError
 from edge.artifacts.manifest import Artifacts, TensorContract
+from edge.artifacts.providers import opened_with
 from edge.core.device import OPENVINO
 
 if TYPE_CHECKING:
@@ -126,9 +127,9 @@ class Graph:
                 f"{contract.file}: made for {self.provider}, this ONNX Runtime has {ort.get_available_providers()}; "
                 f"install the package that brings it or export for another target"
             )
-        provider_options = dict(contract.session.options) if provider is None else {}
+        given = contract.session.options if provider is None else {}
+        provider_options = opened_with(self.provider, given, options.intra_op_num_threads)
         if self.provider == OPENVINO:
-            provider_options["num_of_threads"] = str(options.intra_op_num_threads)
             # It would leave nodes that it does not know to ONNX Runtime without a message.
             options.add_session_config_entry("session.disable_cpu_ep_fallback", "1")
         providers = [(self.provider, provider_options)]

@@ -22,6 +22,7 @@ from edge.core.cli import (
     EXIT_DONE,
     EXIT_INTERRUPTED,
     EXIT_REFUSED,
+    check_result_directory,
     check_result_target,
     command_line,
     messages,
@@ -83,6 +84,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     args = parser().parse_args(argv)
     check_result_target(args.json)
+    check_result_directory(args.out)
     variants = variants_of(args.variants)
     if not 1 <= args.jobs <= MAX_JOBS or not 1 <= args.episodes <= 10_000 or not 0 < args.latency <= 60:
         raise ConditionsError(

@@ -90,6 +90,12 @@ class _Layout:
         sound = has_clear_legs(task.route) and is_true(task, texts, self.scene, self._grid, self._lines, THRESHOLD_M)
         return (task, tuple(texts)) if sound else None
 
+    def robot_for(self, task: Task, wanted: str) -> str:
+        """Return the wanted robot if it has room at start and goal, else the other one."""
+        grid = self._grids[wanted]
+        fits = grid.is_free(*task.start[:2]) and grid.is_free(*task.goal)
+        return wanted if fits else next(robot for robot in ROBOTS if robot != wanted)
+
     def shortest_m(self, task: Task, robot: str) -> float:
         return round(self._grids[robot].distance_m(task.start[:2], task.goal), 3)
 
@@ -121,7 +127,7 @@ def build_layout(layout: _Layout, places: _Places, kind_number: int, seed: int) 
         if not places.has(cell):
             continue
         number = places.taken[cell]
-        robot = ROBOTS[(number + turns) % len(ROBOTS)]
+        robot = layout.robot_for(task, ROBOTS[(number + turns) % len(ROBOTS)])
         people = INDOOR_CROWDS[(list(places.taken).index(cell) * PER_CELL + number) % len(INDOOR_CROWDS)]
         shortest_m = layout.shortest_m(task, robot)
         if band_of(shortest_m) != cell[0]:
