@@ -17,6 +17,10 @@ from tools.mutants.operators import mutants_of
 
 SOURCE = '''"""A module."""
 from dataclasses import dataclass
+from enum import Enum
+class Colour(Enum):
+    """A colour."""
+    RED = "red"
 LIMIT: int = 3
 TWICE = LIMIT * 2
 @dataclass(frozen=True)
@@ -91,12 +95,13 @@ class TestGraft:
             ("LIMIT: int = 3 | 3 -> 4", "Box(4).fits()", True),
             ("LIMIT: int = 3 | 3 -> 4", "TWICE", 8),
             ("size: int = 5 | 5 -> 6", "Box().size", 6),
+            ("'red' -> 'red_'", "RED.value", "red_"),
         ],
     )
     def test_a_change_reaches_objects_that_were_imported_before(
         self, module, part: str, expression: str, expected: object
     ) -> None:
-        names = {"Box": module.Box}  # as another module has imported it
+        names, red = {"Box": module.Box}, module.Colour.RED  # as another module has imported them
         [mutant] = [mutant for mutant in mutants_of(SOURCE) if part in mutant.key]
         graft(module, mutant)
         value = {
@@ -106,6 +111,7 @@ class TestGraft:
             "Box(3).half": lambda: names["Box"](3).half,
             "Box().size": lambda: names["Box"]().size,
             "TWICE": lambda: module.TWICE,
+            "RED.value": lambda: red.value,
         }[expression]()
         assert value == expected
 

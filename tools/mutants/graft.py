@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import enum
 import importlib.abc
 import importlib.machinery
 import importlib.util
@@ -80,7 +81,11 @@ def _code(old: types.FunctionType, new: types.FunctionType) -> None:
 
 
 def _values(old: type, new: type) -> None:
-    """Take the changed class's plain values, and of a dataclass the fields and the generated `__init__`."""
+    """Take the changed class's plain values, an enumeration's too, and a dataclass's fields and `__init__`."""
+    if issubclass(old, enum.Enum) and issubclass(new, enum.Enum):
+        for member, changed in zip(old, new, strict=True):
+            member._value_ = changed.value
+        return
     generated = ("__dataclass_fields__", "__init__") if "__dataclass_fields__" in vars(new) else ()
     for name, value in vars(new).items():
         if name in generated or (_is_simple(value) and not name.startswith("__")):

@@ -278,6 +278,25 @@ class TestInTheWay:
         assert runner.asked_ms == []
         assert 6_000 <= runner.now_ms <= 6_500
 
+    def test_it_is_a_refusal_too_while_the_bridge_has_a_reason_of_its_own(self) -> None:
+        bench = Bench(battery=3)
+        bench.step()
+        runner = Runner(bench, in_the_way="dark")
+        with pytest.raises(RefusedError, match="not armed: dark"):
+            runner.run()
+
+    def test_it_is_a_refusal_once_an_operator_has_permitted(self) -> None:
+        runner = Runner()
+
+        def permit_in_the_dark() -> None:
+            runner.in_the_way = "dark"
+            runner.permit()
+
+        runner.at_ms[2_100] = permit_in_the_dark
+        with pytest.raises(RefusedError, match="not armed: dark"):
+            runner.run()
+        assert 8_000 <= runner.now_ms <= 9_000 and runner.said[-1] == "not armed yet: dark"
+
     def test_a_transient_obstacle_is_waited_for(self) -> None:
         runner = Runner(Bench(), in_the_way="dark")
         runner.at_ms[4_000] = runner.clear
