@@ -23,7 +23,7 @@ tiers = @folder=$$(mktemp -d) && trap 'rm -rf "$$folder"' EXIT && export EDGE_TE
 # Tests start hundreds of processes; without compiled modules on the disk each would compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo demos nano faults contract test test-slow test-random test-all stops lint clean
+.PHONY: help demo demos nano faults contract test test-slow test-random test-all stops coverage mutants lint clean
 
 help:
 	@echo "make demo   export, simulate, drive for $(DURATION) s and write out/demo/report.html"
@@ -38,6 +38,8 @@ help:
 	@echo "make test-slow    the tests that 'make test' leaves out"
 	@echo "make test-random  the property tests with a random seed, which is printed; SEED=N repeats one"
 	@echo "make stops  every stop and kill 20 times, with its times and distances (about 10 min)"
+	@echo "make coverage  branch coverage of the bridge's rules and link; fails below 100 % (about 2 min)"
+	@echo "make mutants   change safety-critical modules in small ways; fails when no test notices one (resumes)"
 	@echo "make lint   ruff and mypy only"
 	@echo "make clean  remove out/ (keeps .venv)"
 
@@ -108,6 +110,16 @@ test-all: lint
 
 stops: .venv/.test-installed
 	$(PYTEST) -s -m repeated tests/process/bridge
+
+# The threshold is in pyproject.toml.
+COVERING = $(wildcard tests/firmware_bridge/test_*.py) tests/firmware_bridge/core tests/firmware_bridge/can tests/firmware_bridge/ros2/test_ros2_config.py \
+	tests/firmware_bridge/unitree/test_robot_state.py
+coverage: .venv/.test-installed
+	OMP_NUM_THREADS=1 $(BIN)/coverage run --data-file=.venv/coverage -m pytest -q -m "not slow and not process" $(COVERING)
+	$(BIN)/coverage report --data-file=.venv/coverage
+
+mutants: .venv/.test-installed
+	OMP_NUM_THREADS=1 $(BIN)/python -m tools.mutants
 
 clean:
 	rm -rf out
