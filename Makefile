@@ -32,6 +32,7 @@ help:
 	@echo "make demos  the demo with ten seeds (about 15 min); out/demos/SEED/report.html"
 	@echo "make nano   train the shipped model from nothing into out/nano-run (hours; Ctrl-C and again goes on)"
 	@echo "make faults inject every fault into real processes, some 230 times (about 15 min), and write out/faults/"
+	@echo "make faults PER_ROW=20 LOAD=2  each fault 20 times beside two busy processes; resumes; the table: python -m tools.faults --table out/faults"
 	@echo "make contract  faults of link, bridge and runner on every robot, 20 times each, into out/contract/ (an hour; resumes)"
 	@echo "make test   lint, type-check and run the fast tests (less than 5 min on 2 cores)"
 	@echo "make test-all     lint, type-check and run every test (about 15 min on 2 cores)"
@@ -73,10 +74,12 @@ nano: .venv/.demo-installed
 	@OMP_NUM_THREADS=$$(( ($$(nproc) + 1) / 2 )) $(BIN)/torchrun --nproc-per-node 2 -m tools.train.cli all --preset nano --out out/nano-run --resume
 	@$(BIN)/edge-train card --out out/nano-run --ship export/weights
 
-# The demo's artifacts, if they are there; otherwise its own.
+# The demo's artifacts, if they are there; otherwise its own. make faults PER_ROW=20: a second call goes on where the first
+# was ended; delete out/faults after a change of the code. LOAD=2: beside two busy processes.
+LOAD = 0
 faults: .venv/.demo-installed
 	@grep -qs '"schema_version": 4' out/demo/artifacts/manifest.json || $(BIN)/edge-export --target cpu --model nano --random-weights 0 --out out/demo/artifacts
-	@$(BIN)/python -m tools.faults --robot $(ROBOT) --artifacts out/demo/artifacts --out out/faults
+	@$(BIN)/python -m tools.faults --robot $(ROBOT) --artifacts out/demo/artifacts --out out/faults --load $(LOAD) $(if $(PER_ROW),--per-row $(PER_ROW) --resume)
 
 # One robot: make contract ROBOTS=carter-can. A second call keeps the rows that are there; OUT=DIR writes elsewhere.
 ROBOTS = go2 carter-can carter-mavlink carter-ros2

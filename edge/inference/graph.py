@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.generic]
 
+CONTEXT_AXIS = "T"
+"""Free axis along which a semantic state grows, up to the model's context."""
 CPU_PROVIDER = "CPUExecutionProvider"
 DTYPES: dict[str, type[np.generic]] = {
     "float": np.float32,
@@ -114,6 +116,9 @@ class Graph:
             affinities = ";".join([worker] * (options.intra_op_num_threads - 1))
             options.add_session_config_entry("session.intra_op_thread_affinities", affinities)
         options.inter_op_num_threads = 1
+        if any(CONTEXT_AXIS in tensor.shape for tensor in contract.inputs):
+            # ONNX Runtime keeps a plan of memory for every length of the context that it has seen: some KiB each.
+            options.enable_mem_pattern = False
         # A spinning worker would occupy the other thread's core.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         options.log_severity_level = 3
