@@ -117,7 +117,8 @@ class Ros2Messages:
         stamp_ns, tick = self._newest.get("/tick", (0, {}))
         if now_ns - stamp_ns > SILENT_NS:
             return self._status("driving", STALE, "the run has no new tick", [])
-        active = [str(name) for name in tick.get("active") or ()]
+        given = tick.get("active")
+        active = [str(name) for name in given] if isinstance(given, list) else []
         level = max((_level(name) for name in active), default=OK)
         message = ", ".join(active) or str(tick.get("reason") or "driving")
         names = ("supervisor", "delay_s", "frame_age_ms", "duration_ms", "late_ms", "speed_scale", "generation")
@@ -209,5 +210,5 @@ def _turn(theta_rad: float) -> Quaternion_:
 
 
 def _text(value: object) -> str:
-    """Return a value as text without the byte that ends a text on the wire."""
-    return str(value).replace("\0", "")
+    """Return a value as text that the wire can carry: UTF-8, without the byte that ends a text."""
+    return str(value).replace("\0", "").encode(errors="replace").decode()

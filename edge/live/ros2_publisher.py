@@ -24,7 +24,7 @@ from firmware_bridge.core.config_ros2 import dds_topic
 from firmware_bridge.core.robot_state import DdsError
 from firmware_bridge.core.sections import DdsConfig
 from firmware_bridge.dds.binding import has_reader
-from firmware_bridge.dds.bus import DDS_ERRORS, Bus
+from firmware_bridge.dds.bus import DDS_ERRORS, DECODE_ERRORS, Bus
 
 DIAGNOSTICS_S: Final = 1.0
 DEPTH: Final = 10
@@ -50,6 +50,8 @@ class Publisher:
         record: dict[str, Any] | bytes = datagram.payload
         if datagram.kind == wire.RECORD:
             record = json.loads(datagram.payload)
+            if not isinstance(record, dict):
+                return
         elif datagram.kind != wire.PICTURE:
             return
         for published in self._messages.of(datagram.topic, datagram.stamp_ns, record, _clock_ns()):
@@ -64,8 +66,8 @@ class Publisher:
         try:
             if has_reader(writer):
                 writer.write(published.message)
-        except DDS_ERRORS:
-            self.failed += 1  # a network that is away for a moment costs this message
+        except (*DDS_ERRORS, *DECODE_ERRORS):
+            self.failed += 1  # a network that is away for a moment, or a value outside its type, costs this message
 
 
 def serve(runner: socket.socket) -> None:

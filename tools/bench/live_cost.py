@@ -265,7 +265,7 @@ def _print(result: Mapping[str, Any]) -> None:
         tick, ratios = figure["tick_ms"], figure["ratios"]
         row = [figure["ticks"], tick["p50"], tick["p99"], tick["p999"], figure["missed"], ratios["p50"], ratios["p99"]]
         table.add_row(name, *map(str, (*row, figure["runner_cpu_percent"], figure["view_cpu_percent"])))
-    console = Console()
+    console = Console(width=110)
     console.print(table)
     for name, figure in result.get("memory", {}).items():
         first, last, slope = figure["first_mib"], figure["last_mib"], figure["slope_mib_per_h"]

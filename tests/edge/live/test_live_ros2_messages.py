@@ -99,6 +99,18 @@ def test_a_run_without_a_new_tick_is_stale(messages: Ros2Messages) -> None:
     assert status(messages, "driving", 8_000_000_000).level == STALE
 
 
+@pytest.mark.parametrize("text", ["Scene:\0 a corridor", "a lone \ud800 surrogate"])
+def test_a_text_that_the_wire_cannot_carry_is_mended(messages: Ros2Messages, text: str) -> None:
+    record = {"text": text, "anchor_pose": None, "waypoints": None}
+    assert published(messages, "/semantic", record)["reasoning"].serialize()
+
+
+@pytest.mark.parametrize("active", [5, None, "x", {"a": 1}])
+def test_faults_that_are_no_list_are_no_faults(messages: Ros2Messages, active: object) -> None:
+    messages.of("/tick", 5_000_000_000, tick(active=active), CLOCK_NS)
+    assert status(messages, "driving").level == OK
+
+
 def test_power_and_battery_are_in_the_diagnostics(messages: Ros2Messages) -> None:
     messages.of("/power", 1, {"total_w": 14.5, "rails": {"cpu": 3.0}, "tagged": "modelled"}, CLOCK_NS)
     messages.of("/battery", 1, {"soc_percent": 80}, CLOCK_NS)

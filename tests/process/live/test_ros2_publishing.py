@@ -64,6 +64,7 @@ def put_all(feed: Ros2Feed) -> None:
     feed.put("/semantic", now, {"text": "Scene: a corridor.", "anchor_pose": None, "waypoints": None})
 
 
+@pytest.mark.slow
 def test_it_is_announced_as_rclpy_announces_publishers(feed: Ros2Feed, listener: Bus) -> None:
     check(Discovery(listener).until(set(ANNOUNCED)), ANNOUNCED)
 
@@ -90,6 +91,7 @@ def test_every_topic_arrives_at_a_reliable_and_at_a_best_effort_subscriber(feed:
     assert abs(stamp.sec - time.clock_gettime(time.CLOCK_REALTIME)) < 5
 
 
+@pytest.mark.slow
 def test_it_reads_nothing_from_the_network(feed: Ros2Feed, listener: Bus) -> None:
     found = Discovery(listener).until(set(ANNOUNCED))
     assert {direction for _, direction in found} == {"publishes"}
@@ -100,6 +102,7 @@ def test_a_network_that_cannot_be_joined_is_one_line(dds_domain: int) -> None:
         Ros2Feed(robot(dds_domain, publish_interface="none0"), lambda line: None)
 
 
+@pytest.mark.slow
 def test_it_ends_with_the_runner(feed: Ros2Feed) -> None:
     process = next(each for each in psutil.Process().children() if "edge.live.ros2_publisher" in each.cmdline())
     feed.close()
