@@ -23,7 +23,7 @@ tiers = @folder=$$(mktemp -d) && trap 'rm -rf "$$folder"' EXIT && export EDGE_TE
 # Tests start hundreds of processes; without compiled modules on the disk each would compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo demos nano faults contract test test-slow test-random test-all stops lint clean
+.PHONY: help demo demos nano faults contract test test-slow test-random test-all stops coverage mutants lint clean
 
 help:
 	@echo "make demo   export, simulate, drive for $(DURATION) s and write out/demo/report.html"
@@ -32,12 +32,15 @@ help:
 	@echo "make demos  the demo with ten seeds (about 15 min); out/demos/SEED/report.html"
 	@echo "make nano   train the shipped model from nothing into out/nano-run (hours; Ctrl-C and again goes on)"
 	@echo "make faults inject every fault into real processes, some 230 times (about 15 min), and write out/faults/"
+	@echo "make faults PER_ROW=20 LOAD=2  each fault 20 times beside two busy processes; resumes; the table: python -m tools.faults --table out/faults"
 	@echo "make contract  faults of link, bridge and runner on every robot, 20 times each, into out/contract/ (an hour; resumes)"
 	@echo "make test   lint, type-check and run the fast tests (less than 5 min on 2 cores)"
 	@echo "make test-all     lint, type-check and run every test (about 15 min on 2 cores)"
 	@echo "make test-slow    the tests that 'make test' leaves out"
 	@echo "make test-random  the property tests with a random seed, which is printed; SEED=N repeats one"
 	@echo "make stops  every stop and kill 20 times, with its times and distances (about 10 min)"
+	@echo "make coverage  branch coverage of the bridge's rules and link; fails below 100 % (about 2 min)"
+	@echo "make mutants   change safety-critical modules in small ways; fails when no test notices one (resumes)"
 	@echo "make lint   ruff and mypy only"
 	@echo "make clean  remove out/ (keeps .venv)"
 
@@ -71,10 +74,12 @@ nano: .venv/.demo-installed
 	@OMP_NUM_THREADS=$$(( ($$(nproc) + 1) / 2 )) $(BIN)/torchrun --nproc-per-node 2 -m tools.train.cli all --preset nano --out out/nano-run --resume
 	@$(BIN)/edge-train card --out out/nano-run --ship export/weights
 
-# The demo's artifacts, if they are there; otherwise its own.
+# The demo's artifacts, if they are there; otherwise its own. make faults PER_ROW=20: a second call goes on where the first
+# was ended; delete out/faults after a change of the code. LOAD=2: beside two busy processes.
+LOAD = 0
 faults: .venv/.demo-installed
 	@grep -qs '"schema_version": 4' out/demo/artifacts/manifest.json || $(BIN)/edge-export --target cpu --model nano --random-weights 0 --out out/demo/artifacts
-	@$(BIN)/python -m tools.faults --robot $(ROBOT) --artifacts out/demo/artifacts --out out/faults
+	@$(BIN)/python -m tools.faults --robot $(ROBOT) --artifacts out/demo/artifacts --out out/faults --load $(LOAD) $(if $(PER_ROW),--per-row $(PER_ROW) --resume)
 
 # One robot: make contract ROBOTS=carter-can. A second call keeps the rows that are there; OUT=DIR writes elsewhere.
 ROBOTS = go2 carter-can carter-mavlink carter-ros2
@@ -108,6 +113,16 @@ test-all: lint
 
 stops: .venv/.test-installed
 	$(PYTEST) -s -m repeated tests/process/bridge
+
+# The threshold is in pyproject.toml.
+COVERING = $(wildcard tests/firmware_bridge/test_*.py) tests/firmware_bridge/core tests/firmware_bridge/can tests/firmware_bridge/ros2/test_ros2_config.py \
+	tests/firmware_bridge/unitree/test_robot_state.py
+coverage: .venv/.test-installed
+	OMP_NUM_THREADS=1 $(BIN)/coverage run --data-file=.venv/coverage -m pytest -q -m "not slow and not process" $(COVERING)
+	$(BIN)/coverage report --data-file=.venv/coverage
+
+mutants: .venv/.test-installed
+	OMP_NUM_THREADS=1 $(BIN)/python -m tools.mutants
 
 clean:
 	rm -rf out

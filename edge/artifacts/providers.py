@@ -9,6 +9,7 @@ hardware, 2); they were not tested on a board.
 from __future__ import annotations
 
 import grp
+import json
 import os
 import re
 import stat
@@ -29,7 +30,7 @@ ALLOWED: Final[Mapping[str, frozenset[str]]] = {
         "arena_extend_strategy", "cudnn_conv_algo_search", "cudnn_conv_use_max_workspace",
         "do_copy_in_default_stream", "gpu_mem_limit", "prefer_nhwc", "use_tf32",
     }),
-    OPENVINO: frozenset({"device_type", "num_of_threads", "num_streams", "precision"}),
+    OPENVINO: frozenset({"device_type", "inference_precision", "num_of_threads", "num_streams", "precision"}),
 }  # fmt: skip
 """Permitted options: those of the shipped targets, and similar ones for users' targets."""
 _VALUE: Final = re.compile(r"[A-Za-z0-9_.:,+-]{0,4096}", re.ASCII)
@@ -46,6 +47,19 @@ def wrong_option(provider: str, options: Mapping[str, str]) -> str | None:
         if not _VALUE.fullmatch(value) or ".." in value:
             return f"option {key} is {value[:80]!r}; expected a number, a choice or shapes, and no path"
     return None
+
+
+def opened_with(provider: str, options: Mapping[str, str], threads: int) -> dict[str, str]:
+    """Return what ONNX Runtime gets: for OpenVINO the graph's threads and `inference_precision` in its own form."""
+    given = dict(options)
+    if provider != OPENVINO:
+        return given
+    given["num_of_threads"] = str(threads)
+    precision = given.pop("inference_precision", None)
+    if precision is not None:
+        hint = {"INFERENCE_PRECISION_HINT": precision}
+        given["load_config"] = json.dumps({given.get("device_type", "CPU"): hint})
+    return given
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from edge.artifacts.files import HASH_BLOCK_BYTES, FileIdentity, read_manifest
 from edge.artifacts.manifest import Artifacts, TensorContract
 from edge.core.cli import write_whole
 from edge.core.device import OPENVINO, TENSORRT, DeviceFacts, available_providers, read_device
-from edge.inference.graph import DTYPES, Array, Graph, GraphError
+from edge.inference.graph import CONTEXT_AXIS, DTYPES, Array, Graph, GraphError
 from firmware_bridge.system.input_file import read_json
 
 ENGINES_NAME = "engines.json"
@@ -33,8 +33,6 @@ MAX_BYTES = 4_000_000
 BUSY_LINE_S = 15.0
 TIMING_SUFFIX = ".timing"
 PROFILES = ("min", "opt", "max")
-CONTEXT_AXIS = "T"
-"""Free axis along which a semantic state grows, up to the model's context."""
 _CACHE_OPTIONS = {
     TENSORRT: ("trt_engine_cache_path", "trt_timing_cache_path"),
     OPENVINO: ("cache_dir",),

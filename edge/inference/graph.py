@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from edge.artifacts.files import ArtifactError
 from edge.artifacts.manifest import Artifacts, TensorContract
+from edge.artifacts.providers import opened_with
 from edge.core.device import OPENVINO
 
 if TYPE_CHECKING:
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.generic]
 
+CONTEXT_AXIS = "T"
+"""Free axis along which a semantic state grows, up to the model's context."""
 CPU_PROVIDER = "CPUExecutionProvider"
 DTYPES: dict[str, type[np.generic]] = {
     "float": np.float32,
@@ -113,6 +116,9 @@ class Graph:
             affinities = ";".join([worker] * (options.intra_op_num_threads - 1))
             options.add_session_config_entry("session.intra_op_thread_affinities", affinities)
         options.inter_op_num_threads = 1
+        if any(CONTEXT_AXIS in tensor.shape for tensor in contract.inputs):
+            # ONNX Runtime keeps a plan of memory for every length of the context that it has seen: some KiB each.
+            options.enable_mem_pattern = False
         # A spinning worker would occupy the other thread's core.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         options.log_severity_level = 3
@@ -126,9 +132,9 @@ class Graph:
                 f"{contract.file}: made for {self.provider}, this ONNX Runtime has {ort.get_available_providers()}; "
                 f"install the package that brings it or export for another target"
             )
-        provider_options = dict(contract.session.options) if provider is None else {}
+        given = contract.session.options if provider is None else {}
+        provider_options = opened_with(self.provider, given, options.intra_op_num_threads)
         if self.provider == OPENVINO:
-            provider_options["num_of_threads"] = str(options.intra_op_num_threads)
             # It would leave nodes that it does not know to ONNX Runtime without a message.
             options.add_session_config_entry("session.disable_cpu_ep_fallback", "1")
         providers = [(self.provider, provider_options)]

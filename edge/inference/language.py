@@ -9,7 +9,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 
 import numpy as np
 import onnxruntime as ort
@@ -36,6 +36,9 @@ from edge.reasoning.prompt import (
 )
 from edge.state.reasoning_text import MAX_TEXT_CHARS
 from edge.state.ring import EncodedFrame
+
+KNOWN_TOKENS = 4096
+"""Number of tokens of which it is known whether they end a line or are a number; a text has some hundred."""
 
 
 class ContextOverflowError(ValueError):
@@ -131,7 +134,7 @@ class LanguageModel:
         """Prompt tokens before the first frame whose rows the buffers hold, from position 0."""
         self.speculator: Speculator | None = None
         """Guesses the next tokens; None: one new token a call."""
-        self.ends_line = cache(lambda token: self.text_of([token]).endswith("\n"))
+        self.ends_line = lru_cache(KNOWN_TOKENS)(lambda token: self.text_of([token]).endswith("\n"))
         """Return whether a token's text ends a line."""
 
     def check_instruction(self, instruction: str) -> None:
@@ -217,7 +220,7 @@ class LanguageModel:
     def guess_for(self, call_ns: Mapping[int, float]) -> None:
         """Forget earlier texts, and guess for a device with these durations of a call by its number of rows, ns."""
         first = self.tokenizer.encode(FIRST_TEXT, add_special_tokens=False).ids
-        is_number = cache(lambda token: any(character.isdigit() for character in self.text_of([token])))
+        is_number = lru_cache(KNOWN_TOKENS)(lambda token: any(map(str.isdigit, self.text_of([token]))))
         self.speculator = Speculator(first, call_ns, self.ends_line, is_number)
 
     def run(self, call: Call, chunk: Chunk, past: int, interrupt: Interrupt | None) -> list[int]:

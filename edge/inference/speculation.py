@@ -36,6 +36,8 @@ from edge.state.reasoning_text import (
     format_text,
 )
 
+MOST_FOLLOWERS: Final = 8192
+"""Number of single tokens and pairs whose follower is known, at most 2 MiB: a large vocabulary has a billion pairs."""
 MEMORY: Final = 200.0
 """Number of recent guesses that determine the acceptance."""
 FIRST_TEXT: Final = format_text(
@@ -118,11 +120,18 @@ class EarlierTexts:
         self.put(first)
 
     def put(self, text: Sequence[int]) -> None:
-        """Take the tokens of a finished text."""
+        """Take the tokens of a finished text; the followers that were seen longest ago are dropped."""
         self.newest = tuple(text)
         for i, token in enumerate(text):
-            self._followers[tuple(text[max(0, i - 2) : i])] = token
-            self._followers[tuple(text[max(0, i - 1) : i])] = token
+            for tokens in (tuple(text[max(0, i - 2) : i]), tuple(text[max(0, i - 1) : i])):
+                self._followers.pop(tokens, None)  # so that the newest is the last one
+                self._followers[tokens] = token
+        while len(self._followers) > MOST_FOLLOWERS:
+            del self._followers[next(iter(self._followers))]
+
+    def __len__(self) -> int:
+        """Return the number of known followers."""
+        return len(self._followers)
 
     def follower(self, tokens: Sequence[int]) -> int | None:
         """Return what followed the last tokens; None: unknown."""

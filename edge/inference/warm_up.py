@@ -11,6 +11,7 @@ import numpy as np
 
 from edge.artifacts.files import MANIFEST_NAME, ArtifactError, read_manifest
 from edge.artifacts.manifest import Artifacts
+from edge.artifacts.runtime import RuntimeConfig
 from edge.core.geometry import SE2
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
@@ -72,6 +73,7 @@ def warm_up(policy: Policy, language: LanguageModel, speculation: Speculation) -
     generation = language.generate(language.prompt.build(frames, "stop"), max_new_tokens=4, cancelled=lambda: False)
     context = policy.semantic_context(generation.last_layer_kv)
     semantic = SemanticState(0, 0, here, 0, generation.last_layer_kv, context, "", STRAIGHT_AHEAD)
+    _run_largest_context(policy, runtime, frames[-1])
     took_ms: list[float] = []
     for _ in range(COLD_TICKS + WARM_TICKS):
         started_ns = time.monotonic_ns()
@@ -79,6 +81,14 @@ def warm_up(policy: Policy, language: LanguageModel, speculation: Speculation) -
         took_ms.append((time.monotonic_ns() - started_ns) / 1e6)
     note = language.speculate() if speculation is Speculation.ON else None
     return WarmUp(statistics.median(took_ms[COLD_TICKS:]), () if note is None else (note,))
+
+
+def _run_largest_context(policy: Policy, runtime: RuntimeConfig, frame: EncodedFrame) -> None:
+    """Run a tick on the longest semantic state, so that no later one makes ONNX Runtime extend its memory."""
+    kv = np.zeros((1, runtime.max_context, runtime.kv_dim), dtype=np.float32)
+    here = frame.T_odom_base
+    semantic = SemanticState(0, 0, here, 0, kv, policy.semantic_context(kv), "", STRAIGHT_AHEAD)
+    policy.act(frame.tokens, (0.0, 0.0, 0.0), 0.0, here, semantic)
 
 
 def check_tick(artifacts: Artifacts, tick_ms: float) -> None:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections import deque
 from dataclasses import dataclass
 
 WINDOW_M = 1.0
 """The drift of a metre: short enough to be current, long enough to stand out of the reference's own noise."""
+MOST_COMPARISONS = 2048
+"""Number of comparisons kept in a limited memory: a robot that turns on the spot adds them without driving a metre."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,7 @@ class DriftMonitor:
 
     def __init__(self, memory_m: float = 20.0) -> None:
         self._memory_m = memory_m
+        self._most = MOST_COMPARISONS if math.isfinite(memory_m) else sys.maxsize
         self._part: deque[Comparison] = deque()
         self._part_m = 0.0
         self._windows: deque[tuple[float, float, float, float]] = deque()
@@ -53,7 +57,7 @@ class DriftMonitor:
         part.append(comparison)
         self._part_m += comparison.distance_m
         self._driven_m += comparison.distance_m
-        while self._part_m - part[0].distance_m >= WINDOW_M:
+        while self._part_m - part[0].distance_m >= WINDOW_M or len(part) > self._most:
             self._part_m -= part.popleft().distance_m
         if self._part_m < WINDOW_M:
             return
@@ -69,10 +73,14 @@ class DriftMonitor:
         self._windows.append(entry)
         for index in range(3):
             self._sums[index] += entry[index]
-        while self._windows and self._driven_m - self._windows[0][3] > self._memory_m:
+        while self._driven_m - self._windows[0][3] > self._memory_m or len(self._windows) > self._most:
             old = self._windows.popleft()
             for index in range(3):
                 self._sums[index] -= old[index]
+
+    def __len__(self) -> int:
+        """Return the number of kept comparisons and windows."""
+        return len(self._part) + len(self._windows)
 
     def rate(self) -> DriftRate:
         """The estimate now."""

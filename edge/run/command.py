@@ -29,6 +29,7 @@ from edge.core.cli import (
     command_line,
     write_result,
 )
+from edge.core.heap import keep_large_blocks_apart
 from edge.flightlog.reader import parts
 from edge.inference import engines
 from edge.inference.release import ReleaseDelayError, parse_release_delay
@@ -193,6 +194,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(args: argparse.Namespace, say: Callable[[str], None], sessions: list[RunSession]) -> int:
+    keep_large_blocks_apart()
     cv2.setNumThreads(1)
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     received: list[int] = []

@@ -1,13 +1,12 @@
-"""The bridge's two sockets and what an operator's command does at them; no robot, none of the bridge's rules."""
+"""What an operator's command does at the bridge's sockets; no robot, none of the bridge's rules."""
 
 from __future__ import annotations
 
 import errno
-import os
 import socket
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -16,128 +15,16 @@ from edge.deploy import units
 from firmware_bridge import operate as operate_module
 from firmware_bridge import peer as peer_module
 from firmware_bridge.bridge import main as bridge_main
-from firmware_bridge.client import BridgeClient, BridgeUnavailable
-from firmware_bridge.client_link import ClientLink, listen
-from firmware_bridge.core.config import OPERATOR_SUFFIX, SERVICE_SOCKET, ConfigError, runtime_dir
-from firmware_bridge.core.link import Arm, BridgeStatus, Message, Stop, encode
+from firmware_bridge.client_link import ClientLink
+from firmware_bridge.core.config import OPERATOR_SUFFIX, SERVICE_SOCKET
+from firmware_bridge.core.link import Arm, BridgeStatus, Message, Stop
 from firmware_bridge.operate import operate
 from tests.support.processes import GO2_SIM
-
-STOP = encode(Stop())
-
-
-def connected_to(path: Path) -> socket.socket:
-    client = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    client.connect(str(path))
-    return client
 
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     return tmp_path / "bridge.sock"
-
-
-class TestOneClient:
-    def test_a_client_that_goes_is_seen_to_go_before_a_waiting_one_is_let_in(self, path: Path) -> None:
-        with closing(ClientLink(path)) as link:
-            first = connected_to(path)
-            link.receive()
-            first.close()
-            second = connected_to(path)
-            seen = []
-            for _ in range(2):
-                link.receive()
-                seen.append(link.connected)
-            assert seen == [False, True]
-            second.close()
-
-    @pytest.mark.parametrize("error", [errno.EMFILE, errno.ECONNABORTED])
-    def test_a_connection_that_cannot_be_accepted_ends_nothing_and_is_not_polled_in_a_loop(
-        self, path: Path, error: int, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        def fail(_: socket.socket) -> None:
-            raise OSError(error, os.strerror(error))
-
-        with closing(ClientLink(path)) as link:
-            listening = link.files()
-            with monkeypatch.context() as patch:
-                patch.setattr(socket.socket, "accept", fail)
-                assert link.receive() == []
-                assert link.files() == []
-            link.receive()
-            assert link.files() == listening
-
-
-class TestOperators:
-    def test_another_operator_swallows_no_stop(self, path: Path) -> None:
-        with closing(ClientLink(path, places=4)) as link:
-            first = connected_to(path)
-            link.receive()
-            first.send(STOP)
-            second = connected_to(path)
-            assert link.receive() == [Stop()]
-            link.receive()
-            first.send(STOP)
-            assert link.receive() == [Stop()]
-            first.close()
-            second.close()
-
-    def test_the_newest_of_many_replaces_the_oldest(self, path: Path) -> None:
-        with closing(ClientLink(path, places=4)) as link:
-            clients = []
-            for _ in range(6):
-                clients.append(connected_to(path))
-                link.receive()
-            clients[-1].send(STOP)
-            assert link.receive() == [Stop()]
-            assert clients[0].recv(1) == b""
-            for client in clients:
-                client.close()
-
-
-class TestFolder:
-    @pytest.fixture
-    def folder(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-        monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-        return runtime_dir()
-
-    def test_it_is_made_for_this_user_alone(self, folder: Path) -> None:
-        listen(folder / "bridge.sock").close()
-        assert folder.stat().st_mode & 0o777 == 0o700
-
-    @pytest.mark.parametrize("bits", [0o770, 0o707, 0o711])
-    def test_one_that_others_may_enter_is_refused(self, folder: Path, bits: int) -> None:
-        folder.mkdir()
-        folder.chmod(bits)
-        with pytest.raises(ConfigError, match="expected a folder of this user's alone"):
-            listen(folder / "bridge.sock")
-
-    def test_a_link_to_a_folder_is_refused(self, folder: Path, tmp_path: Path) -> None:
-        (tmp_path / "elsewhere").mkdir(mode=0o700)
-        folder.symlink_to(tmp_path / "elsewhere")
-        with pytest.raises(ConfigError, match="expected a folder of this user's alone"):
-            listen(folder / "bridge.sock")
-
-    def test_another_users_is_refused(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        folder.mkdir(mode=0o700)
-        owner = folder.stat().st_uid
-        monkeypatch.setattr(os, "getuid", lambda: owner + 1)
-        with pytest.raises(ConfigError, match=f"of user {owner}"):
-            listen(folder / "bridge.sock")
-
-    def test_an_unreadable_folder_is_one_line(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        def denied(_: Path) -> bool:
-            raise PermissionError(errno.EACCES, "Permission denied")
-
-        monkeypatch.setattr(Path, "exists", denied)
-        with pytest.raises(ConfigError, match="cannot be used: Permission denied"):
-            listen(path)
-
-    def test_a_listener_of_another_user_is_not_believed(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        with closing(ClientLink(path)):
-            monkeypatch.setattr(peer_module, "peer_uid", lambda _: os.getuid() + 1)
-            with pytest.raises(BridgeUnavailable, match="not to a bridge of this user's"):
-                BridgeClient(path)
 
 
 class Answering:

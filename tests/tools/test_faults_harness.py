@@ -23,6 +23,7 @@ from sim_hil.protocols.mavlink.parameters import TABLE
 from sim_hil.protocols.ros2.front_end import BASE_TIMEOUT_S
 from sim_hil.realtime.robots import ROBOTS, StackRobot
 from tools.faults import __main__ as command
+from tools.faults.busy import busy_processes
 from tools.faults.measure import Sample
 from tools.faults.report import RowResult, markdown, read_results, result
 from tools.faults.rig import circle, driver
@@ -168,11 +169,55 @@ def test_the_table_has_a_row_for_each_fault_and_a_column_for_each_robot() -> Non
     assert markdown([go2, can]).splitlines() == [
         "| fault | judged | go2 | carter-can |",
         "|---|---|---|---|",
-        "| camera stops | zero | ≤ 500: 200 / 200, n 2 | – |",
-        "| other | zero | – | ≤ 300: 400 / 400, n 1 **failed** |",
+        "| camera stops | zero | ≤ 500: 200 / 200 / 200, n 2 | – |",
+        "| other | zero | – | ≤ 300: 400 / 400 / 400, n 1 **failed** |",
         "",
         "Load of the machine (1 min): go2 1.0 to 1.0, carter-can 2.0 to 2.0.",
     ]
+
+
+def test_under_load_a_stall_of_the_machine_is_not_granted() -> None:
+    assert RowResult(row(), [Sample(310.0, 20.0)], busy=2).problems == [
+        "p99.9 above 300 ms",
+    ]
+    assert RowResult(row(), [Sample(310.0, 20.0)], busy=2).granted == 0
+
+
+def test_loaded_results_stand_beside_the_quiet_ones_and_broken_bounds_name_their_protection(tmp_path: Path) -> None:
+    held, broken = RowResult(rows()[0], [Sample(100.0, 0.0)]), RowResult(rows()[0], [Sample(900.0, 0.0)], busy=2)
+    for busy, one in ((0, held), (2, broken)):
+        command.result_file(tmp_path, busy).write_text(json.dumps(result([one], {}, "go2", busy)))
+    lines = markdown(command.read_tables([tmp_path])).splitlines()
+    assert lines[0] == "| fault | judged | go2 | go2, 2 busy processes |"
+    assert lines[2] == "| camera stops | zero | ≤ 500: 100 / 100 / 100, n 1 | ≤ 500: 900 / 900 / 900, n 1 **failed** |"
+    assert lines[-2] == "Bounds that do not hold under load:"
+    assert lines[-1].startswith("- camera stops (go2, 2 busy processes): p99.9 above 500 ms; protected by its control")
+
+
+@pytest.mark.parametrize(
+    ("fault", "judge", "protection"),
+    [
+        ("camera-stopped", None, "control thread"),
+        ("runner-killed", None, "its service's"),
+        (None, Judge.ROBOT, "own timer"),
+    ],
+)
+def test_a_bound_is_protected_by_the_process_that_reacts(
+    fault: str | None, judge: Judge | None, protection: str
+) -> None:
+    assert protection in RowResult(Row("test", fault, lambda rig: 0, judge=judge), []).protected_by
+
+
+def test_the_load_is_so_many_processes_that_end_with_the_measurement() -> None:
+    with busy_processes(2) as pids:
+        commands = [Path(f"/proc/{pid}/cmdline").read_bytes() for pid in pids]
+    assert len(set(pids)) == 2 and all(b"while True" in one for one in commands)
+    assert not any(Path(f"/proc/{pid}").exists() for pid in pids)
+
+
+def test_a_number_of_injections_holds_for_slow_rows_too() -> None:
+    slow = replace(row(), share=0.2)
+    assert command.count(slow, None) == 1 and command.count(slow, 20) == 20
 
 
 def test_every_fault_of_the_table_is_injected_or_says_why_not() -> None:
@@ -247,7 +292,14 @@ def test_without_a_runner_a_fault_cannot_be_asked_for(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "arguments", [["--rows", "rain", "--list"], ["--per-row", "0", "--list"], ["--artifacts", "nowhere"], []]
+    "arguments",
+    [
+        ["--rows", "rain", "--list"],
+        ["--per-row", "0", "--list"],
+        ["--load", "-1", "--list"],
+        ["--artifacts", "nowhere"],
+        [],
+    ],
 )
 def test_bad_arguments_are_refused_in_one_line(
     arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -14,10 +14,10 @@ import random
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -39,6 +39,7 @@ from sim_hil.protocols.fault_socket import FaultError
 from sim_hil.realtime.children import StepError, uninterrupted
 from sim_hil.realtime.robots import GO2, MAX_DOMAIN, ROBOTS, StackRobot
 from sim_hil.realtime.stack import socket_dir
+from tools.faults.busy import MOST_BUSY, busy_processes
 from tools.faults.host_stall import HostStall
 from tools.faults.measure import Sample, injection
 from tools.faults.report import RowResult, markdown, read_results, result, show
@@ -48,10 +49,13 @@ from tools.report.machine import machine_facts
 
 _print = messages("faults")
 
+PER_ROW = 5
+"""Injections a row by default; slow rows get their share of it."""
 EXAMPLES = """examples:
   python -m tools.faults --artifacts out/nano --out out/faults
   python -m tools.faults --artifacts out/nano --out out/faults --rows "camera*" --rows "runner SIG*" --per-row 20
   python -m tools.faults --robot carter-can --contract --per-row 20 --artifacts out/nano --out out/contract/carter-can
+  python -m tools.faults --artifacts out/nano --out out/faults --per-row 20 --resume --load 2
   python -m tools.faults --table out/contract/go2 out/contract/carter-can
   python -m tools.faults --list
 exit codes: 0 every bound held, 1 a bound did not hold or an injection failed, 2 bad arguments, 130 interrupted"""
@@ -69,14 +73,19 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--out", type=Path, default=Path("out/faults"), metavar="DIR", help="default: out/faults")
     p.add_argument("--rows", action="append", metavar="GLOB", help="only rows whose name matches (may be repeated)")
     p.add_argument(
-        "--per-row", type=int, default=5, metavar="N", help="injections a row; slow rows get fewer (default: 5)"
+        "--per-row", type=int, metavar="N", help=f"injections of every row (default: {PER_ROW}, of slow rows fewer)"
+    )
+    p.add_argument(
+        "--load",
+        type=int,
+        default=0,
+        metavar="N",
+        help="keep N busy processes of ordinary priority beside (default: 0)",
     )
     p.add_argument("--seed", type=int, default=0, help="seed of the injection times (default: 0)")
     p.add_argument("--robot", choices=tuple(ROBOTS), default=GO2.name, help=f"robot to drive (default: {GO2.name})")
     p.add_argument("--domain", type=int, metavar="N", help="DDS domain of a robot with DDS (default: a free one)")
-    p.add_argument(
-        "--contract", action="store_true", help="only the rows of the table of backends and faults, all N times"
-    )
+    p.add_argument("--contract", action="store_true", help="only the rows of the table of backends and faults")
     p.add_argument(
         "--resume", action="store_true", help="keep the injections that --out already has, and make the missing ones"
     )
@@ -92,16 +101,16 @@ def chosen(globs: Sequence[str] | None, robot: StackRobot = GO2, *, contract: bo
     """Return the robot's rows whose names match. Raises ValueError if a pattern matches none."""
     everything = rows(robot)
     if contract:
-        everything = tuple(replace(row, share=1.0) for row in everything if row.name in CONTRACT)
+        everything = tuple(row for row in everything if row.name in CONTRACT)
     for glob in globs or ():
         if not any(fnmatch.fnmatch(row.name, glob) for row in everything):
             raise ValueError(f"--rows {glob!r}: no such row; see --list")
     return [row for row in everything if not globs or any(fnmatch.fnmatch(row.name, glob) for glob in globs)]
 
 
-def count(row: Row, per_row: int) -> int:
-    """Return the number of injections of a row."""
-    return max(1, round(row.share * per_row))
+def count(row: Row, per_row: int | None) -> int:
+    """Return the number of injections of a row; None: the default, of which slow rows get a share."""
+    return max(1, round(row.share * PER_ROW)) if per_row is None else per_row
 
 
 def run_row(
@@ -112,6 +121,7 @@ def run_row(
     host: HostStall,
     *,
     kept: RowResult | None = None,
+    busy: int = 0,
     keep: Callable[[RowResult], None] = lambda result: None,
 ) -> RowResult:
     """Make all injections of one row. Raises FaultError if the robot's side does not answer.
@@ -120,7 +130,7 @@ def run_row(
     """
     samples = [] if kept is None else list(kept.samples)
     repeated = 0 if kept is None else kept.repeated
-    done = RowResult(row, samples, repeated, 0.0 if kept is None else kept.load)
+    done = RowResult(row, samples, repeated, 0.0 if kept is None else kept.load, busy)
     for index in range(len(samples), times):
         sample = attempt(rig, row, rng, host)
         _show(row, f"{index + 1}/{times}", sample)
@@ -132,7 +142,7 @@ def run_row(
             _show(row, f"{index + 1}/{times} again", sample)
             sample.wrong += sample.hindered
         samples.append(sample)
-        done = RowResult(row, samples, repeated, round(os.getloadavg()[0], 1))
+        done = RowResult(row, samples, repeated, round(os.getloadavg()[0], 1), busy)
         keep(done)
     return done
 
@@ -158,16 +168,16 @@ def _show(row: Row, which: str, sample: Sample) -> None:
 
 
 def run(args: argparse.Namespace, wanted: Sequence[Row]) -> list[RowResult]:
-    """Inject into all rows; results until an interrupt or a failure of the rig stay in `faults.json`.
+    """Inject into all rows; results until an interrupt or a failure of the rig stay in their file (`result_file`).
 
     Raises StepError if no flight could be recorded, FaultError if edge-hil does not answer.
     """
-    robot, file = ROBOTS[args.robot], args.out / "faults.json"
+    robot, file = ROBOTS[args.robot], result_file(args.out, args.load)
     results = {one.row.name: one for one in (read_results(file, rows(robot)) if args.resume else [])}
 
     def keep(one: RowResult) -> None:
         results[one.row.name] = one
-        write_result(str(file), result(list(results.values()), machine_facts(), robot.name))
+        write_result(str(file), result(list(results.values()), machine_facts(), robot.name, args.load))
 
     with ExitStack() as stack:
         folder = stack.enter_context(socket_dir())
@@ -179,10 +189,28 @@ def run(args: argparse.Namespace, wanted: Sequence[Row]) -> list[RowResult]:
         rig = stack.enter_context(Rig(folder, args.artifacts.absolute(), args.domain, _print, stack_robot=robot))
         _print(f"starting the robot's side: {robot.name}, {rig.config.address}")
         rig.start()
+        stack.enter_context(busy_processes(args.load))
         rng = random.Random(args.seed)
         for row in wanted:
-            run_row(rig, row, count(row, args.per_row), rng, host, kept=results.get(row.name), keep=keep)
+            times, kept = count(row, args.per_row), results.get(row.name)
+            run_row(rig, row, times, rng, host, kept=kept, busy=args.load, keep=keep)
     return list(results.values())
+
+
+def result_file(out: Path, busy: int) -> Path:
+    """Return the file of the results on the quiet machine, or beside so many busy processes."""
+    return out / (f"faults-load-{busy}.json" if busy else "faults.json")
+
+
+def read_tables(folders: Sequence[Path]) -> list[Mapping[str, Any]]:
+    """Read the results in these folders, each quiet before loaded. Raises OSError or ValueError."""
+    found: list[Mapping[str, Any]] = []
+    for folder in folders:
+        loaded = sorted(folder.glob("faults-load-*.json"))
+        quiet = result_file(folder, 0)
+        files = [quiet, *loaded] if quiet.exists() or not loaded else loaded
+        found += [json.loads(file.read_text("utf-8")) for file in files]
+    return found
 
 
 def keep_logs(folder: Path, out: Path) -> None:
@@ -203,10 +231,12 @@ def main(argv: list[str] | None = None) -> int:
     try:
         wanted = chosen(args.rows, ROBOTS[args.robot], contract=args.contract)
         check_result_target(args.json)
-        if args.per_row < 1:
+        if args.per_row is not None and args.per_row < 1:
             raise ValueError(f"--per-row {args.per_row}: expected at least 1")
+        if not 0 <= args.load <= MOST_BUSY:
+            raise ValueError(f"--load {args.load}: expected 0 to {MOST_BUSY} busy processes")
         if args.table is not None:
-            print(markdown([json.loads((folder / "faults.json").read_text("utf-8")) for folder in args.table]))
+            print(markdown(read_tables(args.table)))
             return EXIT_DONE
         if not args.list and (args.artifacts is None or not args.artifacts.is_dir()):
             raise ValueError(f"--artifacts {args.artifacts}: expected a directory made by edge-export")
@@ -232,7 +262,7 @@ def main(argv: list[str] | None = None) -> int:
     except (StepError, FaultError, OSError, ValueError) as error:
         _print(str(error))
         return EXIT_CHECK_FAILED
-    summary = result(results, machine_facts(), args.robot)
+    summary = result(results, machine_facts(), args.robot, args.load)
     write_result(args.json, summary)
     show(results, Console(stderr=args.json == "-", width=150))
     return EXIT_DONE if summary["pass"] else EXIT_CHECK_FAILED

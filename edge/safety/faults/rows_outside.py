@@ -12,7 +12,7 @@ BRIDGE: tuple[Fault, ...] = (
         "commands-late", 22, Action.STOP, 300, "bridge",
         "The bridge got no good command in time.",
         "Another program uses the processor: edge-doctor names it; then arm again.",
-        "tests/firmware_bridge/test_bridge_core.py::TestDeadman::test_the_wire_is_zero_when_the_last_good_command_is_250_ms_old",
+        "tests/firmware_bridge/core/test_bridge_core.py::TestDeadman::test_the_wire_is_zero_when_the_last_good_command_is_250_ms_old",
     ),
     Fault(
         "graph-hung", 23, Action.STOP, 300, "bridge",
@@ -36,7 +36,7 @@ BRIDGE: tuple[Fault, ...] = (
         "control-thread-dead", 28, Action.STOP, 300, "bridge",
         "The runner runs but its control thread is dead: no commands arrive.",
         "The watchdog restarts the runner; report it with the journal.",
-        "tests/firmware_bridge/test_bridge_core.py::TestDeadman::test_the_wire_is_zero_when_the_last_good_command_is_250_ms_old",
+        "tests/firmware_bridge/core/test_bridge_core.py::TestDeadman::test_the_wire_is_zero_when_the_last_good_command_is_250_ms_old",
     ),
     Fault(
         "runner-frozen", 29, Action.STOP, 300, "bridge",
@@ -67,13 +67,13 @@ BRIDGE: tuple[Fault, ...] = (
         "link-lost", 35, Action.STOP, 1300, "bridge",
         "The robot no longer sends anything.",
         "Check the cable to the robot and that the robot is on, then arm again.",
-        "tests/firmware_bridge/test_bridge_dangers.py::test_without_the_robots_state_zero_goes_out_after_the_deadmans_time_and_the_state_is_not_latched",
+        "tests/firmware_bridge/core/test_bridge_dangers.py::test_without_the_robots_state_zero_goes_out_after_the_deadmans_time_and_the_state_is_not_latched",
     ),
     Fault(
         "message-reordered", 36, Action.NOTHING, 0, "bridge",
         "A command arrived twice or out of order and was dropped.",
         "Nothing to do.",
-        "tests/firmware_bridge/test_bridge_core.py::TestGate::test_a_sequence_number_that_does_not_increase_is_rejected",
+        "tests/firmware_bridge/core/test_bridge_core.py::TestGate::test_a_sequence_number_that_does_not_increase_is_rejected",
     ),
     Fault(
         "state-from-future", 36, Action.NOTHING, 0, "bridge",
@@ -86,19 +86,19 @@ BRIDGE: tuple[Fault, ...] = (
         "message-flood", 37, Action.NOTHING, 0, "bridge",
         "Old messages arrived in a burst and were dropped by their age.",
         "Nothing to do.",
-        "tests/firmware_bridge/test_bridge_core.py::TestDeadman::test_a_queue_of_old_commands_after_a_suspended_runner_is_refused",
+        "tests/firmware_bridge/core/test_bridge_core.py::TestDeadman::test_a_queue_of_old_commands_after_a_suspended_runner_is_refused",
     ),
     Fault(
         "late-motion", 38, Action.STOP, 40, "bridge",
         "A motion command overtook the stop; the stop was sent again.",
         "Nothing to do: the bridge keeps sending zero.",
-        "tests/firmware_bridge/test_bridge_dangers.py::TestStopAgain::test_a_late_move_is_followed_by_a_zero_within_40_ms_whenever_it_comes",
+        "tests/firmware_bridge/core/test_bridge_dangers.py::TestStopAgain::test_a_late_move_is_followed_by_a_zero_within_40_ms_whenever_it_comes",
     ),
     Fault(
         "stop-call-blocked", 39, Action.NOTHING, 0, "bridge",
         "The robot does not answer StopMove; the bridge has already sent zero velocity.",
         "If it persists, restart the robot.",
-        "tests/firmware_bridge/test_bridge_core.py::TestEveryStop::test_a_zero_move_and_then_a_stop_move_go_out_first",
+        "tests/firmware_bridge/core/test_bridge_core.py::TestEveryStop::test_a_zero_move_and_then_a_stop_move_go_out_first",
     ),
     Fault(
         "second-commander", 40, Action.STOP, 500, "bridge",
@@ -144,13 +144,13 @@ BRIDGE: tuple[Fault, ...] = (
         "robot-mode-left", 42, Action.STOP, 1000, "bridge",
         "The robot left its driving modes by itself.",
         "Check the robot: it may have fallen or been taken over; then arm again.",
-        "tests/firmware_bridge/test_bridge_core.py::TestEveryStop::test_a_zero_move_and_then_a_stop_move_go_out_first",
+        "tests/firmware_bridge/core/test_bridge_core.py::TestEveryStop::test_a_zero_move_and_then_a_stop_move_go_out_first",
     ),
     Fault(
         "robot-error", 42, Action.STOP, 1000, "bridge",
         "The robot reports an error of its own.",
         "Find the error code in the maker's manual before arming again.",
-        "tests/firmware_bridge/test_bridge_dangers.py::TestEveryDanger::test_it_stops_a_driven_robot_in_the_same_step",
+        "tests/firmware_bridge/core/test_bridge_dangers.py::TestEveryDanger::test_it_stops_a_driven_robot_in_the_same_step",
     ),
     Fault(
         "can-bus-off", 43, Action.STOP, 100, "bridge",
@@ -175,7 +175,7 @@ BRIDGE: tuple[Fault, ...] = (
         "robot-link-down", 46, Action.STOP, 100, "bridge",
         "Commands cannot be sent: the network to the robot is down or its queue is full.",
         "Check the interface or device that the robot file names; edge-doctor says what is missing.",
-        "tests/firmware_bridge/test_bridge_dangers.py::TestEveryDanger::test_it_stops_a_driven_robot_in_the_same_step",
+        "tests/firmware_bridge/core/test_bridge_dangers.py::TestEveryDanger::test_it_stops_a_driven_robot_in_the_same_step",
     ),
     Fault(
         "emergency-stop", 47, Action.STOP, 60, "bridge",
@@ -187,7 +187,7 @@ BRIDGE: tuple[Fault, ...] = (
         "emergency-stop-latched", 47, Action.STOP, 0, "bridge",
         "An emergency stop was pressed while the robot was not driven: it latches in every state of the bridge.",
         "Find out why, then run `edge-bridge arm` while a runner waits.",
-        "tests/firmware_bridge/test_bridge_model.py::test_after_an_emergency_stop_nothing_moves_the_robot_without_an_operator",
+        "tests/firmware_bridge/core/test_bridge_model.py::test_after_an_emergency_stop_nothing_moves_the_robot_without_an_operator",
     ),
     Fault(
         "permission-expired", 47, Action.NOTHING, 0, "bridge",
@@ -238,7 +238,7 @@ START: tuple[Fault, ...] = (
         "bad-configuration", 57, Action.STOP, 0, "start",
         "The robot file has an unknown key, or a value beyond what the robot allows.",
         "Correct the key that the message names.",
-        "tests/firmware_bridge/test_robot_config.py::test_a_wrong_file_is_refused_in_one_line",
+        "tests/firmware_bridge/core/test_robot_config.py::test_a_wrong_file_is_refused_in_one_line",
     ),
     Fault(
         "interface-absent", 46, Action.STOP, 0, "start",
@@ -250,7 +250,7 @@ START: tuple[Fault, ...] = (
         "wrong-robot", 58, Action.STOP, 0, "start",
         "The robot file is for another robot or protocol.",
         "Name the file of the robot that is connected.",
-        "tests/firmware_bridge/test_bridge_dangers.py::TestIdentity::test_another_robot_is_refused_before_anything_moves",
+        "tests/firmware_bridge/core/test_bridge_dangers.py::TestIdentity::test_another_robot_is_refused_before_anything_moves",
     ),
     Fault(
         "unsafe-robot", 58, Action.STOP, 0, "start",

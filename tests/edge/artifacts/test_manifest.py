@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from edge.artifacts.files import SCHEMA_VERSION, ArtifactError
 from edge.artifacts.manifest import load_artifacts
-from edge.artifacts.providers import wrong_option
+from edge.artifacts.providers import opened_with, wrong_option
 from edge.inference.engines import PROFILES
 from edge.inference.graph import Graph
 from edge.inference.language import LanguageModel
@@ -420,6 +420,17 @@ def test_the_session_options_of_the_shipped_targets_are_taken(target: str) -> No
     for provider in load_target(target).providers.values():
         profile = {f"trt_profile_{kind}_shapes": "a.b:1x2,c:3x4" for kind in PROFILES} if provider.engine else {}
         assert wrong_option(provider.name, {**provider.options, **profile}) is None
+
+
+def test_openvino_gets_its_precision_and_threads_in_its_own_form_and_others_what_the_manifest_has() -> None:
+    options = load_target("cpu").providers["openvino"].options
+    assert opened_with("OpenVINOExecutionProvider", options, 2) == {
+        "device_type": "CPU",
+        "num_streams": "1",
+        "num_of_threads": "2",
+        "load_config": '{"CPU": {"INFERENCE_PRECISION_HINT": "bf16"}}',
+    }
+    assert opened_with("CUDAExecutionProvider", {"use_tf32": "0"}, 2) == {"use_tf32": "0"}
 
 
 def test_a_provider_that_this_machine_lacks_is_refused_by_name(copy: Path) -> None:

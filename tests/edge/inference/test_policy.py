@@ -76,7 +76,8 @@ def test_ticks_keep_no_memory_and_ask_the_system_for_none(policy: Policy, artifa
         info = libc.mallinfo2()
         return info.uordblks // 4096, info.arena + info.hblkhd
 
-    assert memory_after(30) == memory_after(30)
+    (kept, asked), (kept_later, asked_later) = memory_after(30), memory_after(30)
+    assert kept_later <= kept and asked_later <= asked
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from edge.inference.graph import CancelledError, Interrupt
 from edge.inference.language import Generation, LanguageModel
 from edge.inference.speculation import (
     FIRST_TEXT,
+    MOST_FOLLOWERS,
     Drafter,
     EarlierTexts,
     Speculator,
@@ -84,6 +85,15 @@ def test_an_item_that_an_earlier_text_had_is_guessed_from_there() -> None:
     for token in (1, 6):
         draft.take(token)
     assert draft.guess(1) == [7]
+
+
+def test_hours_of_new_texts_take_bounded_memory_and_the_newest_are_known() -> None:
+    texts = EarlierTexts([1, LINE_END])
+    for token in range(2, 20_000, 2):
+        texts.put([token, token + 1])
+        assert len(texts) <= MOST_FOLLOWERS
+    assert texts.follower([19_998]) == 19_999
+    assert texts.follower([2]) is None
 
 
 def test_what_the_rules_force_comes_first() -> None:

@@ -11,7 +11,15 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from edge.core.geometry import SE2
-from edge.motion.controller import Controller, ControllerConfig, ControllerInputs, arc_to, scale_to_limits
+from edge.motion.controller import (
+    TURN_IN_PLACE_M,
+    Controller,
+    ControllerConfig,
+    ControllerInputs,
+    arc_to,
+    scale_to_limits,
+    target_of,
+)
 from firmware_bridge.core.config import LimitsConfig
 
 LIMITS = LimitsConfig(
@@ -190,3 +198,70 @@ def test_old_missing_and_future_inputs_stop(
 ) -> None:
     command = Controller(CONFIG).step(ControllerInputs(plan(0.05), frame_age_ms, odometry_age_ms), 0)
     assert (command.vx_mps, command.reason) == (0.0, reason)
+
+
+@pytest.mark.parametrize("field", ["step_s", "frame_max_age_ms", "odometry_max_age_ms"])
+def test_a_step_and_ages_must_be_positive(field: str) -> None:
+    assert getattr(replace(CONFIG, **{field: 0.5}), field) == 0.5
+    for wrong in (0, -1.0):
+        with pytest.raises(ValueError, match="must be positive"):
+            replace(CONFIG, **{field: wrong})
+
+
+@given(st.floats(-2, 2), st.floats(-2, 2), st.floats(-3, 3), st.floats(0.1, 10))
+def test_in_twice_the_time_an_arc_needs_half_the_velocities(x: float, y: float, theta: float, time_s: float) -> None:
+    target = SE2(x, y, theta)
+    assert arc_to(target, 2 * time_s) == pytest.approx(tuple(each / 2 for each in arc_to(target, time_s)))
+
+
+def test_a_target_at_the_turning_distance_is_driven_to_and_a_nearer_one_only_turned_to() -> None:
+    assert arc_to(SE2(TURN_IN_PLACE_M, 0.0, 0.3), 1.0) == (TURN_IN_PLACE_M, 0.0)
+    assert arc_to(SE2(TURN_IN_PLACE_M * 0.999, 0.0, 0.3), 1.0) == (0.0, 0.3)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_target_at_the_side_is_driven_to_in_a_half_circle_and_one_behind_turned_to_by_a_quarter(side: int) -> None:
+    assert arc_to(SE2(0.0, side, 0.0), 1.0) == (pytest.approx(math.pi / 2), pytest.approx(side * math.pi))
+    assert arc_to(SE2(-1e-6, side, 0.0), 1.0) == (0.0, side * math.pi / 2)
+
+
+def test_the_target_of_a_short_plan_is_its_last_point_and_of_coarse_steps_the_first() -> None:
+    points = np.float32([[0.1, 0.0, 0.0], [0.2, 0.0, 0.0], [0.3, 0.0, 0.0]])
+    assert target_of(points, 0.1).x_m == pytest.approx(0.3)
+    assert target_of(points, 0.5).x_m == pytest.approx(0.2)
+    assert target_of(points, 3.0).x_m == pytest.approx(0.1)
+    assert settled(np.float32([[0.3, 0.0, 0.0]])) == (pytest.approx(0.3), 0.0)
+
+
+@given(st.floats(0.1, 3.0), st.floats(0.1, 4.0), st.floats(0, 10), st.floats(-10, 10), st.floats(0.01, 1.0))
+def test_a_scaled_velocity_is_the_fastest_on_its_arc(
+    vx_max: float, wz_max: float, speed: float, yaw_rate: float, share: float
+) -> None:
+    limits = replace(LIMITS, vx_max_mps=vx_max, wz_max_radps=wz_max)
+    vx, wz = scale_to_limits(speed, yaw_rate, limits, share)
+    assert vx * yaw_rate == pytest.approx(wz * speed, abs=1e-9)
+    at_a_limit = vx == pytest.approx(vx_max * share) or abs(wz) == pytest.approx(wz_max * share)
+    assert at_a_limit or (vx, wz) == (pytest.approx(speed), pytest.approx(yaw_rate))
+
+
+@pytest.mark.parametrize("gap_ms", [20, 100, 200])
+def test_both_velocities_begin_at_zero_and_rise_by_acceleration_times_the_time_passed(gap_ms: int) -> None:
+    controller, turn = Controller(CONFIG), fresh(plan(0.05, 0.04))
+    first = controller.step(turn, 0)
+    assert (first.vx_mps, first.wz_radps) == (0.0, 0.0)
+    second = controller.step(turn, gap_ms * 1_000_000)
+    assert (second.vx_mps, second.vy_mps, second.reason) == (pytest.approx(2.0 * gap_ms / 1e3), 0.0, "ok")
+    assert second.wz_radps == pytest.approx(4.0 * gap_ms / 1e3)
+    assert controller.config is CONFIG
+
+
+@given(st.floats(0, 500), st.floats(0, 200))
+def test_inputs_up_to_their_greatest_age_drive(frame_age_ms: float, odometry_age_ms: float) -> None:
+    for ages in ((frame_age_ms, odometry_age_ms), (500.0, 200.0), (0.0, 0.0)):
+        command = Controller(CONFIG).step(ControllerInputs(plan(0.05), *ages), 0)
+        assert command.reason == "ok"
+
+
+def test_zero_is_zero_in_every_direction() -> None:
+    command = Controller(CONFIG).halt("held")
+    assert (command.vx_mps, command.vy_mps, command.wz_radps, command.target) == (0.0, 0.0, 0.0, None)

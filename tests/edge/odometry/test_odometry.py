@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from edge.core.geometry import SE2, wrap_angle
 from edge.odometry.calibration import OdometryCalibration
+from edge.odometry.drift_rate import MOST_COMPARISONS, Comparison, DriftMonitor
 from edge.odometry.estimator import DriftEstimator
 from edge.odometry.gate import OdometryInputs
 from edge.odometry.visual_odometry import VisualMotion
@@ -202,6 +203,16 @@ def test_the_drift_rate_is_that_of_the_robots_own_odometry(scale: float, drift_d
 def test_without_a_camera_nothing_is_claimed_about_the_drift() -> None:
     rate = run(drive(20), DriftEstimator()).drift
     assert rate.m_per_m is None and rate.rad_per_m is None
+
+
+@pytest.mark.parametrize("distance_m", [0.0, 1e-4, 0.25], ids=["turns on the spot", "creeps", "drives"])
+def test_hours_of_comparisons_take_bounded_memory(distance_m: float) -> None:
+    monitor = DriftMonitor()
+    for _ in range(3 * MOST_COMPARISONS):
+        monitor.add(Comparison(distance_m, 0.001, 0.0, 0.01, 1e-8, 1e-8))
+        assert len(monitor) <= 2 * MOST_COMPARISONS
+    rate = monitor.rate()
+    assert rate.rad_per_m is None or np.isfinite(rate.rad_per_m)
 
 
 def test_camera_motions_that_come_twice_or_out_of_order_are_used_once() -> None:

@@ -146,3 +146,8 @@ def test_no_order_of_findings_gives_speed_while_a_zero_is_there_or_after_a_stop(
         if stopped or Action.ZERO in actions or Action.STOP in actions:
             assert out.speed_scale == 0.0
         assert len(out.active) <= len(FAULTS)
+
+
+def test_the_states_have_the_names_that_the_log_and_the_service_report() -> None:
+    names = ["STARTING", "READY", "RUNNING", "DEGRADED", "STOPPED"]
+    assert [state.value for state in State] == [state.name for state in State] == names

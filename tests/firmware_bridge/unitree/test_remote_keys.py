@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from firmware_bridge.unitree.remote import StopKeys
-from tests.firmware_bridge.test_bridge_estop import STATES
+from tests.firmware_bridge.core.test_bridge_estop import STATES
 from tests.support.robot.bridge_bench import MS, ZERO, Bench
 
 L2, B, A, START = 1 << 5, 1 << 9, 1 << 8, 1 << 2

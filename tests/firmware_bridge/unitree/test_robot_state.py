@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from firmware_bridge.core.robot_state import BatteryState, RobotState, StampOrder
+from firmware_bridge.core.robot_state import BatteryState, RobotState, StampOrder, within
 from firmware_bridge.unitree.messages.idl import SportModeState_, TimeSpec_
 from firmware_bridge.unitree.report import battery_state, robot_state
 from sim_hil.protocols.unitree.odometry import OdometryFrame
@@ -143,3 +144,45 @@ class TestOrder:
         assert order.accept(state(0, received_ns=S))
         assert not order.accept(state(10**18, received_ns=S + 1))
         assert order.accept(state(0, received_ns=S + 2))
+
+
+class TestClock:
+    """How far ahead of ours a robot's clock may be: 500 ms more than it was, and 1 ms a second of drift."""
+
+    def order(self, *reports: tuple[float, float]) -> StampOrder:
+        """An order that has accepted reports of (robot's stamp, our time), s."""
+        made = StampOrder()
+        for stamp_s, received_s in reports:
+            assert made.accept(replace(state(0), robot_stamp_ns=round(stamp_s * S), received_ns=round(received_s * S)))
+        return made
+
+    def farthest(self, reports: list[tuple[float, float]], received_s: float) -> int:
+        """The largest stamp that is accepted after `reports`, less our time, ns; found by bisection."""
+        low, high = -S, 5 * S
+        while high - low > 1:
+            middle = (low + high) // 2
+            stamp_ns = round(received_s * S) + middle
+            report = replace(state(0), robot_stamp_ns=stamp_ns, received_ns=round(received_s * S))
+            low, high = (middle, high) if self.order(*reports).accept(report) else (low, middle)
+        return low
+
+    def test_a_stamp_may_be_ahead_by_half_a_second_and_the_drift_since_the_last_report(self) -> None:
+        assert self.farthest([(10.0, 10.0)], 10.5) == 500_500_000
+        assert self.farthest([(10.0, 10.0)], 11.0) == 501_000_000
+
+    def test_the_offset_follows_late_reports_and_early_ones_no_faster_than_a_clock_drifts(self) -> None:
+        assert self.farthest([(10.0, 10.0), (10.9, 11.0)], 11.5) == 499_500_000
+        assert self.farthest([(10.0, 10.0), (11.1, 11.0)], 11.5) == 501_500_000
+        assert self.farthest([(10.0, 10.0), (10.9999, 11.0)], 11.5) == 500_400_000
+
+    def test_a_robot_that_begins_to_fill_in_stamps_is_compared_with_its_first_report(self) -> None:
+        self.order((0.0, 10.0), (0.0, 11.0), (0.9, 11.1))
+
+    def test_a_first_stamp_before_zero_is_dropped(self) -> None:
+        order = StampOrder()
+        assert not order.accept(replace(state(0), robot_stamp_ns=-1, received_ns=S // 2)) and order.dropped == 1
+
+
+def test_a_bound_itself_is_within_it_and_nothing_that_is_no_number() -> None:
+    assert within(2.0, -2.0, 0.0, 2.0) and within(2.0)
+    assert not any(within(2.0, wrong) for wrong in (2.0000001, -2.0000001, math.nan, math.inf))

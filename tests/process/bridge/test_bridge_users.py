@@ -5,7 +5,6 @@ from __future__ import annotations
 import grp
 import os
 import shutil
-import stat
 import subprocess
 import sys
 import tempfile
@@ -14,8 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from firmware_bridge.client_link import SocketGroups, listen
-from firmware_bridge.core.config import OPERATOR_SUFFIX, ConfigError
+from firmware_bridge.core.config import OPERATOR_SUFFIX
 from firmware_bridge.peer import is_trusted_listener
 from tests.support.processes import GO2_SIM, REPOSITORY, Running, running
 
@@ -68,40 +66,6 @@ class TestTrust:
 
 def other_groups() -> list[grp.struct_group]:
     return sorted((group for group in grp.getgrall() if group.gr_gid != 0), key=lambda group: group.gr_gid)
-
-
-class TestGroups:
-    def test_one_group_for_runner_and_operators_is_refused(self) -> None:
-        with pytest.raises(ConfigError, match="expected two groups"):
-            SocketGroups("robots", "robots")
-
-    def test_a_group_that_the_machine_does_not_know_is_refused(self, tmp_path: Path) -> None:
-        folder = tmp_path / "run"
-        with pytest.raises(ConfigError, match="no such group"):
-            listen(folder / "bridge.sock", "no-such-group-here")
-
-    def test_a_folder_that_others_may_write_to_is_refused(self, tmp_path: Path) -> None:
-        folder = tmp_path / "run"
-        folder.mkdir()
-        folder.chmod(0o733)
-        with pytest.raises(ConfigError, match="mode 0711"):
-            listen(folder / "bridge.sock", grp.getgrgid(os.getgid()).gr_name)
-
-    def test_a_socket_of_a_group_is_open_to_it_and_its_folder_can_only_be_passed_through(self, tmp_path: Path) -> None:
-        path = tmp_path / "run" / "bridge.sock"
-        old = os.umask(0o077)
-        try:
-            listen(path, grp.getgrgid(os.getgid()).gr_name).close()
-        finally:
-            os.umask(old)
-        assert stat.S_IMODE(path.parent.stat().st_mode) == 0o711
-        assert (stat.S_IMODE(path.stat().st_mode), path.stat().st_gid) == (0o660, os.getgid())
-
-    @pytest.mark.skipif(os.geteuid() == 0, reason="root may give a file to any group")
-    def test_a_group_that_the_bridge_is_not_in_is_refused(self, tmp_path: Path) -> None:
-        foreign = next(group for group in other_groups() if group.gr_gid not in {os.getgid(), *os.getgroups()})
-        with pytest.raises(ConfigError, match="not in it"):
-            listen(tmp_path / "run" / "bridge.sock", foreign.gr_name)
 
 
 @pytest.fixture(scope="class")

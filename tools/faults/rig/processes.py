@@ -12,7 +12,7 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -21,7 +21,7 @@ import can
 
 from firmware_bridge.can.frame import ERROR_BUS_OFF, ERROR_RESTARTED
 from firmware_bridge.can.multicast import LoopbackMulticastBus
-from firmware_bridge.core.config import RobotConfig, load_robot_config
+from firmware_bridge.core.config import BRIDGE_PRIORITY, RobotConfig, load_robot_config
 from sim_hil.processes.child_process import last_lines
 from sim_hil.protocols.fault_socket import FaultClient, FaultError
 from sim_hil.realtime.children import Child, Children, StepError
@@ -66,10 +66,13 @@ class Rig:
         *,
         record: bool = True,
         stack_robot: StackRobot = GO2,
+        runner_arguments: Sequence[str] = (),
+        children: Children | None = None,
     ) -> None:
         """Create the rig with sockets and logs in `folder`; a socket's path has at most 107 bytes.
 
-        Raises StackRobotError for a robot that cannot be driven here.
+        `runner_arguments`: further arguments of edge-run. `children` starts and ends the processes. Raises
+        StackRobotError for a robot that cannot be driven here.
         """
         self.folder = folder
         # A serial line has room for two processes, the bus between processes also for a sniffer and a second commander.
@@ -92,7 +95,8 @@ class Rig:
         self._artifacts = artifacts
         self._record = record
         self._log = log
-        self._children = Children(folder, grace_s=5.0)
+        self._runner_arguments = list(runner_arguments)
+        self._children = children or Children(folder, grace_s=5.0)
         self._trace = LineTail(folder / "trace.jsonl")
         self._obeys: list[tuple[int, bool]] = []
         self._accepted_ns: list[int] = []
@@ -136,8 +140,10 @@ class Rig:
             self._wait(partial(_has_printed, child, line), READY_TIMEOUT_S, child, line)
 
     def start_bridge(self) -> None:
-        """Start edge-bridge and wait for its socket."""
-        self.bridge = self._children.start("edge-bridge", [*COMMANDS["edge-bridge"], *self._link()])
+        """Start edge-bridge with the real-time priority of its service, if permitted, and wait for its socket."""
+        self.bridge = self._children.start(
+            "edge-bridge", [*COMMANDS["edge-bridge"], *self._link()], fifo_priority=BRIDGE_PRIORITY
+        )
         self._wait(partial(_has_printed, self.bridge, "ready"), 30.0, self.bridge, "ready line")
 
     def start_runner(self) -> None:
@@ -156,7 +162,7 @@ class Rig:
         command += ["--artifacts", str(self._artifacts), "--instruction", INSTRUCTION]
         if self._record:
             command += ["--record", str(self.folder / f"flight{self._runs}.mcap")]
-        self.runner = self._children.start(f"edge-run-{self._runs}", command)
+        self.runner = self._children.start(f"edge-run-{self._runs}", [*command, *self._runner_arguments])
         self._inside = FaultClient(socket, self.folder / f"i{self._runs}")
 
     def ensure_moving(self) -> None:

@@ -42,6 +42,61 @@ def test_arguments_override_socket_and_domain(tmp_path: Path) -> None:
     assert (config.bridge.socket, config.dds.domain) == (tmp_path / "s", 7)
 
 
+def test_a_dbc_file_in_a_folder_that_cannot_be_read_is_the_shipped_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def denied(_: Path) -> bool:
+        raise PermissionError(13, "Permission denied")
+
+    copied = tmp_path / "base.toml"
+    copied.write_text(GO2_SIM.with_name("example_can.toml").read_text())
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "is_file", denied)
+        config = load_robot_config(copied).can
+    assert config is not None and config.dbc_path == GO2_SIM.with_name("example_base.dbc")
+
+
+@pytest.mark.parametrize(
+    ("file", "address"),
+    [
+        ("go2_sim.toml", r"DDS domain \d+ on lo"),
+        ("ros2_base.toml", r"DDS domain \d+ on \S+"),
+        ("rover_px4.toml", r"MAVLink \S+"),
+        ("example_can.toml", r"CAN \S+:\S+"),
+    ],
+)
+def test_messages_name_the_robots_address(file: str, address: str) -> None:
+    assert re.fullmatch(address, load_robot_config(GO2_SIM.with_name(file)).address)
+
+
+def test_a_mavlink_link_is_an_address_of_the_network_or_a_serial_device_with_its_speed() -> None:
+    rover = load_robot_config(GO2_SIM.with_name("rover_px4.toml")).mavlink
+    assert rover is not None
+    network = replace(rover, link="udp:10.0.0.7:14540")
+    assert (network.address, network.serial) == (("10.0.0.7", 14540), None)
+    line = replace(rover, link="serial:/dev/ttyACM0:57600")
+    assert line.serial == line.address == ("/dev/ttyACM0", 57600)
+
+
+def test_the_bridge_has_the_rovers_mavlink_system_number_unless_it_has_one_of_its_own() -> None:
+    rover = load_robot_config(GO2_SIM.with_name("rover_px4.toml")).mavlink
+    assert rover is not None
+    assert replace(rover, own_system=0, system=7).station == 7
+    assert replace(rover, own_system=9, system=7).station == 9
+
+
+@pytest.mark.parametrize(("value", "reliable"), [("reliable", True), ("best_effort", False)])
+def test_the_inputs_of_a_ros_2_robot_are_reliable_where_its_file_says_so(value: str, reliable: bool) -> None:
+    base = load_robot_config(GO2_SIM.with_name("ros2_base.toml")).ros2
+    assert base is not None
+    assert replace(base, input_reliability=value).reliable_inputs == reliable
+
+
+def test_a_domain_for_a_robot_without_dds_is_refused() -> None:
+    with pytest.raises(ConfigError, match="protocol can: expected one that uses DDS"):
+        load_robot_config(GO2_SIM.with_name("example_can.toml"), domain=7)
+
+
 @pytest.mark.parametrize(
     ("before", "after", "complaint"),
     [
@@ -55,6 +110,7 @@ def test_arguments_override_socket_and_domain(tmp_path: Path) -> None:
         ('protocol = "unitree"', 'protocol = "carrier pigeon"', "protocol: expected one of"),
         ('velocity_frame = "odom"', 'velocity_frame = "map"', "odometry.velocity_frame"),
         ("[limits]", "[limits", "cannot be read"),
+        ("[camera]", "[[camera]]", "[camera]: expected a table, found ["),
         ("accel_mps2 = 2.0", f"accel_mps2 = {10**400}", "limits.accel_mps2: expected float"),
         (
             "battery_min_percent = 10",

@@ -205,6 +205,39 @@ class TestPermission:
         bench.wait(5000)
         assert bench.status.permit == "needed"
 
+    def test_one_that_is_given_while_the_local_input_is_still_pressed_is_void(self) -> None:
+        bench = self.held()
+        bench.estop = True
+        bench.step(Arm())
+        bench.step(operator=(Arm(),))
+        assert bench.status.permit == "needed" and bench.status.reason.startswith("arm refused")
+        bench.estop = False
+        bench.ask_to_arm()
+        assert bench.status.blocked_by == "estop"
+
+    def test_one_that_is_given_within_a_second_after_the_remotes_keys_is_void(self) -> None:
+        bench = self.held()
+        _remote_estop(bench)
+        bench.step(Arm())
+        bench.step(operator=(Arm(),))
+        assert bench.status.permit == "needed"
+        bench.wait(1_000)
+        bench.permit().arm()
+
+    def test_the_operator_reads_what_it_waits_for(self) -> None:
+        assert self.held().permit().status.reason == "permitted by an operator, waiting for the runner to arm"
+
+    def test_it_lasts_as_long_as_its_arming_needs_once_that_has_sent_a_request(self) -> None:
+        bench = self.held().permit()
+        bench.wait(9_000)
+        bench.mode = ids.MODE_LIE_DOWN
+        bench.ask_to_arm()
+        bench.wait(5_000)
+        assert (bench.status.state, bench.status.permit) == ("arming", "given")
+        bench.mode = ids.MODE_BALANCE_STAND
+        bench.step()
+        assert bench.status.state == "armed"
+
     def test_the_runners_stop_voids_it(self) -> None:
         bench = self.held().permit()
         bench.step(Stop())
