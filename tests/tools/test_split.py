@@ -81,7 +81,7 @@ def test_a_route_of_waypoints_begins_at_the_anchor_and_passes_through_them() -> 
 def test_scenarios_are_of_the_benchmarks_buildings_and_of_a_seed_that_no_stage_uses() -> None:
     scenario = scenario_of(3)
     assert scenario.kind in ("hospital", "office", "warehouse") and scenario.layout_seed >= 100
-    assert scenario == scenario_of(3)
+    assert scenario.episode == scenario_of(3).episode
 
 
 def store(out: Path, variant: str, reached: str) -> None:

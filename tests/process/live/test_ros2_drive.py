@@ -70,14 +70,14 @@ def test_a_node_of_the_domain_receives_every_topic_while_the_robot_drives(
     assert newest["diagnostics"].status[0].hardware_id == "go2"
 
 
-def test_the_robot_drives_on_when_the_publishing_process_is_killed(arguments: list[str]) -> None:
-    runner = start(arguments)
-
-    def publisher() -> list[psutil.Process]:
-        return [each for each in psutil.Process(runner.pid).children() if "edge.live.ros2_publisher" in each.cmdline()]
-
-    wait_for(lambda: bool(publisher()), 60, "the publishing process")
-    publisher()[0].kill()
-    result, error = result_of(runner)
-    assert "ROS 2 publishing has ended; the robot drives on without it" in error
-    assert result["faults"] == [] and result["control"]["ticks"] >= 100
+def test_the_robot_drives_on_when_the_publishing_process_is_killed(arguments: list[str], tmp_path: Path) -> None:
+    result = tmp_path / "result.json"
+    more = ("--duration", 12, "--json", result)
+    with running("edge.run.command", *arguments, *more, folder=tmp_path, ready="driving") as runner:
+        children = psutil.Process(runner.pid).children()
+        (publisher,) = [each for each in children if "edge.live.ros2_publisher" in each.cmdline()]
+        publisher.kill()
+        assert runner.process.wait(60) == 0, runner.stderr()
+        assert "ROS 2 publishing has ended; the robot drives on without it" in runner.stderr()
+    found = json.loads(result.read_text())
+    assert found["faults"] == [] and found["control"]["ticks"] >= 100

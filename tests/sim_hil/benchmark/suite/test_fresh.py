@@ -81,7 +81,8 @@ def test_the_file_is_what_the_builder_builds(kind: str) -> None:
     # The first layout stands for all here; `build_fresh --check` compares the whole.
     built = list(build_fresh.first_layout(kind))
     assert len(built) >= 5
-    assert built == [episode for episode in EPISODES if episode.scene == built[0].scene]
+    in_file = [episode for episode in EPISODES if episode.scene == built[0].scene]
+    assert suite_to_toml(FRESH, build_fresh.VERSION, built) == suite_to_toml(FRESH, build_fresh.VERSION, in_file)
 
 
 @pytest.mark.slow
