@@ -39,7 +39,7 @@ help:
 	@echo "make test-slow    the tests that 'make test' leaves out"
 	@echo "make test-random  the property tests with a random seed, which is printed; SEED=N repeats one"
 	@echo "make stops  every stop and kill 20 times, with its times and distances (about 10 min)"
-	@echo "make coverage  branch coverage of the bridge's rules and link; fails below 100 % (about 3 min)"
+	@echo "make coverage  branch coverage of the bridge's rules and link; fails below 100 % (about 1 min)"
 	@echo "make mutants   change safety-critical modules in small ways; fails when no test notices one (resumes)"
 	@echo "make lint   ruff and mypy only"
 	@echo "make clean  remove out/ (keeps .venv)"
