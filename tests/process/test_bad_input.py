@@ -16,7 +16,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 FEW = ("missing", "deep-list", "fifo", "loop", "not-utf8", "escape-name", "text ''")
 """Bad values of the quick test."""
 WITHOUT_ARGUMENTS = ("tools.fault_table",)
-ON_DEMAND = ("tools.bench.", "tools.can_trace.", "tools.fuzz", "tools.interop.")
+ON_DEMAND = ("tools.bench.", "tools.can_trace.", "tools.fuzz", "tools.interop.", "tools.memory", "tools.mutants")
 """Measurements by hand, whose arguments only their author gives."""
 
 

@@ -18,6 +18,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Final
 
 import pytest
 
@@ -25,6 +26,8 @@ from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, command_
 from firmware_bridge.system.terminal import CommandParser
 from tools.mutants.plan import DONE, TABLE_HEAD, Results, read_equivalents, read_targets, row_of
 from tools.mutants.session import MutantSession
+
+MOST_MINUTES: Final = 7 * 24 * 60
 
 
 def parser() -> argparse.ArgumentParser:
@@ -43,6 +46,9 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command and return its exit code."""
     args = parser().parse_args(argv)
+    if not 0 < args.minutes <= MOST_MINUTES:
+        sys.stderr.write(f"mutants: --minutes {args.minutes}: expected above 0, at most {MOST_MINUTES} (a week)\n")
+        return EXIT_BAD_INPUT
     end_ns = time.monotonic_ns() + round(args.minutes * 60e9)
     modules: list[str] = args.module or list(read_targets())
     if len(modules) == 1 and not args.table:
