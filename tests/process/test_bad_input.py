@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import tempfile
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,11 +23,11 @@ ON_DEMAND = ("tools.bench.", "tools.can_trace.", "tools.fuzz", "tools.interop.",
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The harness's folder, with the good and the bad files."""
-    made = tmp_path_factory.mktemp("bad-input")
-    prepare(made)
-    return made
+def folder() -> Iterator[Path]:
+    """The harness's folder, with the good and the bad files; its path is short, because sockets lie in it."""
+    with tempfile.TemporaryDirectory(prefix="bad-") as made:
+        prepare(Path(made))
+        yield Path(made)
 
 
 def placed(command: Command, artifacts: Path) -> Command:

@@ -128,7 +128,9 @@ class _Gate:
         assert self.asked, "motion after a stop without an arm of the runner"
         assert now_ns <= self.good_until_ns, "a command obeyed that is older than the deadman's time"
         for value, goal in zip((move.vx_mps, move.vy_mps, move.wz_radps), self.goal, strict=True):
-            assert value == 0 or (value * goal > 0 and abs(value) <= abs(goal)), "not the newest good command"
+            # Signs, not a product: that of two of the smallest numbers is zero.
+            same_sign = math.copysign(1.0, value) == math.copysign(1.0, goal)
+            assert value == 0 or (same_sign and abs(value) <= abs(goal)), "not the newest good command"
 
 
 @dataclass

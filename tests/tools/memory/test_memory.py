@@ -74,7 +74,7 @@ def _code(arguments: list[str]) -> int:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("part", "warm", "operations", "heap_bytes", "blocks"),
-    [("camera", 200, 400, 200, 1), ("odometry", 100, 200, 500, 2), ("tick", 40, 40, 500, 2)],
+    [("camera", 200, 400, 200, 1), ("odometry", 100, 200, 500, 2), ("tick", 100, 200, 500, 2)],
 )
 def test_a_part_of_the_runner_keeps_nothing_of_an_operation(
     part: str, warm: int, operations: int, heap_bytes: int, blocks: int, artifacts_dir: Path
