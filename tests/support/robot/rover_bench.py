@@ -105,7 +105,7 @@ class RoverBench:
         )  # fmt: skip
 
     def arrive(self, packet: bytes) -> None:
-        """A packet reaches the bridge, whoever sent it."""
+        """Deliver a packet of any sender to the bridge."""
         self.session.take(packet, self.now_ns)
 
     def pack(self, message: Message, system: int = 1, component: int = 1) -> bytes:
