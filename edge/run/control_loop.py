@@ -21,6 +21,7 @@ from edge.motion.controller import TARGET_TIME_S, Controller, ControllerInputs, 
 from edge.motion.recovery import MOVING, Recovery
 from edge.safety.faults.findings import Finding
 from edge.safety.faults.table import FAULT_OF_CAUSE
+from edge.safety.late_command import LATE_NS
 from edge.safety.monitors.semantic import SemanticConfig
 from edge.safety.monitors.watch import Watch, WatchConfig
 from edge.safety.supervisor import FaultEvent, State, Supervisor, SupervisorInputs, SupervisorOutputs
@@ -155,6 +156,7 @@ class ControlLoop:
         self._clock = clock
         self._tokens: EncodedFrame | None = None
         self._last_tick_ns: int | None = None
+        self._sent_ns: int | None = None
         self._moving = False
         self.supervision = SupervisorOutputs(State.STARTING, 0.0, False, (), (), "")
         """The supervisor's last outputs; any thread may read them."""
@@ -243,6 +245,8 @@ class ControlLoop:
         )
         if command.reason in MOVING:
             self._controller.halt(command.reason)  # the next command accelerates from standstill
+        if self._sent_ns is not None and self._clock() - self._sent_ns >= LATE_NS:
+            command = self._controller.halt("tick-overrun")  # zeros have been sent in its place (late_command)
         self._send(command)
         end_ns = self._clock()
         self._last_tick_ns = end_ns - deadline_ns
@@ -340,7 +344,8 @@ class ControlLoop:
     def _send(self, command: VelocityCommand) -> None:
         self.last_seq += 1
         self._moving = (command.vx_mps, command.vy_mps, command.wz_radps) != (0.0, 0.0, 0.0)
-        if not self._sink.send_velocity(self.last_seq, self._clock(), command.vx_mps, command.vy_mps, command.wz_radps):
+        self._sent_ns = now_ns = self._clock()
+        if not self._sink.send_velocity(self.last_seq, now_ns, command.vx_mps, command.vy_mps, command.wz_radps):
             self.statistics.unsent += 1
 
     def _encode(self, frame: Frame | None) -> EncodedFrame | None:

@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -25,6 +26,7 @@ from edge.odometry.visual_odometry import VisualOdometry, grey_frame
 from edge.run.camera import CameraPoller
 from edge.run.robot_reader import open_reader
 from edge.safety.faults.findings import FindingQueue
+from edge.safety.late_command import HOLD_NS, REPEAT_NS
 from edge.safety.monitors.robot import LinkMonitor
 from edge.state.frame import Frame
 from edge.state.pose_history import PoseHistory
@@ -39,17 +41,39 @@ BATTERY_LOG_HZ = 1.0
 
 
 class CommandTap:
-    """Keeps the velocity in force on its way to the bridge; any thread may read `commanded`."""
+    """Keeps the velocity in force on its way to the bridge; any thread may read `commanded` and call `hold`."""
+
+    SPACING: ClassVar = HOLD_NS // REPEAT_NS + 2
+    """The bridge's numbers per command, so that zeros fit between two commands without a lock."""
 
     def __init__(self, bridge: BridgeClient) -> None:
         self._bridge = bridge
         self.commanded: tuple[float, float, float] | None = None
         """(vx m/s, vy m/s, ωz rad/s) sent last; None before the first."""
+        self._sent = (0, 0)  # number of the last command for the bridge, stamp in ns
+        self._last_hold = 0
+
+    @property
+    def sent_ns(self) -> int | None:
+        """Stamp of the control thread's last command, ns; None before the first."""
+        return self._sent[1] or None
 
     def send_velocity(self, seq: int, stamp_ns: int, vx_mps: float, vy_mps: float, wz_radps: float) -> bool:
-        """See `BridgeClient`."""
+        """See `BridgeClient`; the control thread alone may call it."""
         self.commanded = (vx_mps, vy_mps, wz_radps)
-        return self._bridge.send_velocity(seq, stamp_ns, vx_mps, vy_mps, wz_radps)
+        number = seq * self.SPACING
+        sent = self._bridge.send_velocity(number, stamp_ns, vx_mps, vy_mps, wz_radps)
+        self._sent = (number, stamp_ns)
+        return sent
+
+    def hold(self, stamp_ns: int) -> bool:
+        """Send zero after the last command and before the next one; a second thread may call it."""
+        number = max(self._sent[0], self._last_hold) + 1
+        if number >= self._sent[0] + self.SPACING:
+            return False
+        self._last_hold = number
+        self.commanded = (0.0, 0.0, 0.0)
+        return self._bridge.send_velocity(number, stamp_ns, 0.0, 0.0, 0.0)
 
     def poll(self) -> BridgeStatus | None:
         """See `BridgeClient`."""

@@ -33,6 +33,7 @@ from edge.run.service import ServiceReporter
 from edge.run.views import Views
 from edge.safety.faults.findings import Finding
 from edge.safety.faults.table import FAULTS
+from edge.safety.late_command import hold_while_late
 from edge.safety.watchdog import Hang, ReasoningWatch
 from firmware_bridge.client import BridgeClient, BridgeStatus, BridgeUnavailable
 from firmware_bridge.core.config import RobotConfig
@@ -193,6 +194,7 @@ class RunSession:
             if records is not None:
                 records.put("/run", started_ns, run_record(self._artifacts, self._robot, self._options, started_ns))
                 inputs.recorder = records
+            threading.Thread(target=self._hold, args=(sink,), name="late-command", daemon=True).start()
             end = self._drive(loops, inputs, bridge, channel)
             status = self._halt(bridge, end)
             result = run_result(
@@ -349,6 +351,11 @@ class RunSession:
                 self._finished.set()
 
         return target
+
+    def _hold(self, commands: CommandTap) -> None:
+        """Keep the robot at rest while a command of the control thread is late."""
+        enter(self._schedule.control)
+        hold_while_late(commands, self._finished)
 
     def _watch_run(self, loops: Loops, inputs: RobotInputs, channel: InstructionChannels | None) -> None:
         """Forward lines and instructions and watch reasoning until a thread has ended or a stop is requested."""

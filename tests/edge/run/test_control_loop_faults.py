@@ -317,9 +317,16 @@ def test_a_tick_that_takes_too_long_stops_the_robot_and_a_late_one_does_not(
     changed(encode_ns=tick_ms * MS)(bench)
     bench.tick()
     bench.encode_ns = 0
+    bench.now_ns += PERIOD_NS  # the deadline that the tick slept over is skipped
     bench.see()
     assert (bench.tick()[0] == 0.0) is overrun
     assert found(bench, "tick-overrun") is overrun
+
+
+@pytest.mark.parametrize(("encode_ms", "held"), [(99, False), (100, True)])
+def test_a_command_that_comes_200_ms_after_the_last_one_is_zero(bench: Bench, encode_ms: int, held: bool) -> None:
+    changed(encode_ns=encode_ms * MS)(bench)
+    assert (bench.tick() == (0.0, "tick-overrun")) is held
 
 
 def test_a_process_that_was_frozen(bench: Bench) -> None:

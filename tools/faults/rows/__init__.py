@@ -40,7 +40,6 @@ NOT_INJECTED: Mapping[str, str] = MappingProxyType(
         "semantic-delay-invalid": "needs a defect of the runner's stamps; test on a fake clock",
         "instruction-injected": "has no effect by construction; test over a thousand texts",
         "stop-phrase": "for the robot the same as the end of the runner, which is injected; test with edge-say",
-        "tick-overrun": "such a long tick also exceeds the bridge's deadman (commands-late), which is injected",
         "suspended": "would suspend this machine; test on a fake clock",
         "clock-backwards": "the kernel does not let a process move the monotonic clock; test on a fake clock",
         "thermal-throttle": "needs a board that is hot; test on a fake sysfs tree",
