@@ -14,6 +14,8 @@ from typing import Any, Final
 from tools.mutants.operators import Mutant
 
 _SIMPLE: Final = (bool, int, float, str, bytes, type(None))
+_BUILT_IN: Final = (bool, int, float, str, bytes, list, dict)
+"""Types that are values of a constant, as in a table of expected kinds."""
 
 
 class BrokenModuleError(Exception):
@@ -108,4 +110,4 @@ def _is_simple(value: object) -> bool:
         return all(map(_is_simple, value))
     if isinstance(value, dict):
         return all(_is_simple(each) for pair in value.items() for each in pair)
-    return isinstance(value, _SIMPLE)
+    return isinstance(value, _SIMPLE) or value in _BUILT_IN
