@@ -13,9 +13,10 @@ from pathlib import Path
 
 import pytest
 
+from firmware_bridge import client_link
 from firmware_bridge import peer as peer_module
 from firmware_bridge.client import BridgeClient, BridgeUnavailable
-from firmware_bridge.client_link import ClientLink, SocketGroups, SocketTakenError, listen
+from firmware_bridge.client_link import ClientLink, SocketGroups, SocketTakenError, check_is_ours, listen
 from firmware_bridge.core.config import ConfigError, runtime_dir
 from firmware_bridge.core.link import Arm, BridgeStatus, Message, Stop, decode, encode
 
@@ -91,8 +92,9 @@ class TestOperators:
             first.close()
             second.close()
 
-    def test_the_newest_of_many_replaces_the_oldest(self, path: Path) -> None:
-        with closing(ClientLink(path, places=4)) as link:
+    @pytest.mark.parametrize("places", [2, 4])
+    def test_the_newest_of_many_replaces_the_oldest(self, path: Path, places: int) -> None:
+        with closing(ClientLink(path, places=places)) as link:
             clients = []
             for _ in range(6):
                 clients.append(connected_to(path))
@@ -177,6 +179,13 @@ class TestDatagrams:
                     assert len(decoded(reader)) >= 1
             assert len(decoded(hung)) < 2000
 
+    def test_a_message_reaches_every_client(self, path: Path) -> None:
+        with closing(ClientLink(path, places=2)) as link, connected_to(path) as first, connected_to(path) as second:
+            link.receive()
+            link.receive()
+            link.send(Arm())
+            assert decoded(first) == decoded(second) == [Arm()]
+
     def test_a_message_without_clients_goes_nowhere(self, path: Path) -> None:
         with closing(ClientLink(path)) as link:
             link.send(Arm())
@@ -212,6 +221,50 @@ class TestListening:
         listen(path).close()
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
 
+    @pytest.mark.parametrize("group", [None, OWN_GROUP])
+    def test_the_folders_above_are_made(self, tmp_path: Path, group: str | None) -> None:
+        listen(tmp_path / "run" / "robots" / "bridge.sock", group).close()
+        assert (tmp_path / "run" / "robots" / "bridge.sock").is_socket()
+
+    def test_five_connections_wait_and_no_more(self, path: Path) -> None:
+        waiting: list[socket.socket] = []
+        with closing(listen(path)), pytest.raises(BlockingIOError):
+            while len(waiting) < 20:
+                waiting.append(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
+                waiting[-1].setblocking(False)
+                waiting[-1].connect(str(path))
+        for client in waiting:
+            client.close()
+        assert len(waiting) == 6
+
+    @pytest.mark.parametrize("error", [PermissionError(errno.EACCES, "Permission denied"), ConfigError("no group")])
+    def test_a_refusal_leaves_no_descriptor_open(
+        self, path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+    ) -> None:
+        def fail(*_: object, **_named: object) -> None:
+            raise error
+
+        monkeypatch.setattr(client_link, "_make_folder", fail)
+        before = len(list(Path("/proc/self/fd").iterdir()))
+        with pytest.raises(ConfigError) as refusal:
+            listen(path)
+        assert len(list(Path("/proc/self/fd").iterdir())) == before, refusal.value  # which holds the local variables
+
+    def test_a_stale_socket_that_somebody_else_removes_first_is_no_error(
+        self, path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(socket.socket, "connect_ex", lambda *_: errno.ECONNREFUSED)
+        listen(path).close()
+        assert path.is_socket()
+
+    def test_closing_disconnects_the_clients_and_takes_a_removed_file_for_done(self, path: Path) -> None:
+        link = ClientLink(path)
+        with connected_to(path) as client:
+            link.receive()
+            path.unlink()
+            link.close()
+            assert client.recv(1) == b""
+
 
 class TestGroups:
     def test_one_group_for_runner_and_operators_is_refused(self) -> None:
@@ -238,7 +291,40 @@ class TestGroups:
         finally:
             os.umask(old)
         assert stat.S_IMODE(path.parent.stat().st_mode) == 0o711
-        assert (stat.S_IMODE(path.stat().st_mode), path.stat().st_gid) == (0o660, os.getgid())
+        found = path.stat()
+        assert (stat.S_IMODE(found.st_mode), found.st_uid, found.st_gid) == (0o660, os.getuid(), os.getgid())
+
+    @pytest.mark.parametrize("mode", [0o700, 0o710, 0o721, 0o713])
+    def test_a_folder_that_a_group_cannot_pass_or_others_may_change_is_refused(self, tmp_path: Path, mode: int) -> None:
+        (tmp_path / "run").mkdir()
+        (tmp_path / "run").chmod(mode)
+        with pytest.raises(ConfigError, match="of this user's with mode 0711"):
+            listen(tmp_path / "run" / "bridge.sock", OWN_GROUP)
+
+    def test_a_file_in_the_place_of_the_folder_is_refused(self, tmp_path: Path) -> None:
+        (tmp_path / "run").touch()
+        (tmp_path / "run").chmod(0o711)
+        with pytest.raises(ConfigError, match="of this user's with mode 0711"):
+            listen(tmp_path / "run" / "bridge.sock", OWN_GROUP)
+
+    def test_a_folder_of_another_user_is_refused(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        (tmp_path / "run").mkdir()
+        (tmp_path / "run").chmod(0o711)
+        owner = os.getuid()
+        monkeypatch.setattr(os, "getuid", lambda: owner + 1)
+        with pytest.raises(ConfigError, match=f"of user {owner}"):
+            listen(tmp_path / "run" / "bridge.sock", OWN_GROUP)
+
+    def test_the_reason_is_told_also_when_the_socket_has_gone_meanwhile(
+        self, path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def gone(*_: object) -> None:
+            path.with_name("run").joinpath("bridge.sock").unlink()
+            raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
+
+        monkeypatch.setattr(os, "chown", gone)
+        with pytest.raises(ConfigError, match="not in it"):
+            listen(path.with_name("run") / "bridge.sock", OWN_GROUP)
 
     def test_a_group_that_the_bridge_is_not_in_is_refused_and_leaves_no_socket(
         self, path: Path, monkeypatch: pytest.MonkeyPatch
@@ -268,6 +354,11 @@ class TestFolder:
         folder.chmod(bits)
         with pytest.raises(ConfigError, match="expected a folder of this user's alone"):
             listen(folder / "bridge.sock")
+
+    def test_a_file_is_refused(self, tmp_path: Path) -> None:
+        (tmp_path / "file").touch(mode=0o600)
+        with pytest.raises(ConfigError, match="expected a folder of this user's alone"):
+            check_is_ours(tmp_path / "file")
 
     def test_a_link_to_a_folder_is_refused(self, folder: Path, tmp_path: Path) -> None:
         (tmp_path / "elsewhere").mkdir(mode=0o700)

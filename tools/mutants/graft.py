@@ -62,7 +62,7 @@ def _loaded(module: types.ModuleType, tree: ast.Module) -> types.ModuleType:
     second = importlib.util.module_from_spec(importlib.machinery.ModuleSpec(module.__name__, loader))
     try:
         loader.exec_module(second)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise BrokenModuleError(module.__name__) from error
     return second
 
