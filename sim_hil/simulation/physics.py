@@ -53,8 +53,9 @@ class SimulationClosedError(RuntimeError):
 class Simulation:
     """Deterministic world: the same scene, people, seed, rate and calls give the same motion, step for step.
 
-    `start` (x m, y m, heading rad) replaces the scene's. `gui` shows the physics in a window (needs a display). Raises
-    ValueError for an unknown robot, or if the scene has no room or no routes for that many people.
+    `start` (x m, y m, heading rad) replaces the scene's. `gui` shows the physics in a window (needs a display).
+    `glides`: the robot's stand-in without legs or wheels (sim_hil/robots/gliding.py). Raises ValueError for an unknown
+    robot, or if the scene has no room or no routes for that many people.
     """
 
     DT_S = 0.002  # of the default rate, which real time runs at
@@ -69,6 +70,7 @@ class Simulation:
         robot: str = "go2",
         start: tuple[float, float, float] | None = None,
         rate_hz: int = 500,
+        glides: bool = False,
     ) -> None:
         if robot not in ROBOTS:
             raise ValueError(f"simulation: unknown robot {robot!r}, expected one of {', '.join(ROBOTS)}")
@@ -78,6 +80,7 @@ class Simulation:
         self.rate_hz = rate_hz
         self.dt_s = 1.0 / rate_hz
         self._gui = gui
+        self._glides = glides
         self._looks: list[PersonBody] = []
         self._walkers = People(self.scene, people, seed)
         self._people = self._walkers.poses()
@@ -106,9 +109,7 @@ class Simulation:
         (x0, y0), (x1, y1) = scene.floor_min_m, scene.floor_max_m
         # The floor reaches beyond the walls, so that nothing can ever fall off the world.
         ground = Box(((x0 + x1) / 2, (y0 + y1) / 2, -0.5), (1.0, 0.0), (x1 - x0 + 10, y1 - y0 + 10, 1.0))
-        self._floor = self._static(ground, friction=_FOOTING)
-        for terrain in scene.terrain:
-            self._raised(terrain)
+        self._grounds = [self._static(ground, friction=_FOOTING), *(self._raised(terrain) for terrain in scene.terrain)]
         self._solids = self._obstacles(scene.obstacles())
         self._aside = (x1 + 50.0, y1 + 50.0)
         shape = pybullet.createCollisionShape(
@@ -133,6 +134,8 @@ class Simulation:
         self._place_people()
 
     def _load(self, robot: str, folder: Path) -> Robot:
+        if self._glides:
+            return self._load_gliding(robot)
         module, _, name = ROBOTS[robot].partition(":")
         # Imported by name: a wheeled base's code is not needed to walk, nor the other way round.
         build = cast("Callable[..., Robot]", getattr(importlib.import_module(module), name))
@@ -143,6 +146,14 @@ class Simulation:
             (x, y, z), turn = pybullet.getBasePositionAndOrientation(loaded.body, physicsClientId=self.client)
             pybullet.resetBasePositionAndOrientation(loaded.body, (x, y, z + ground), turn, physicsClientId=self.client)
             loaded.observe()
+        return loaded
+
+    def _load_gliding(self, robot: str) -> Robot:
+        from sim_hil.robots.gliding import GLIDES, GlidingRobot
+
+        loaded = GlidingRobot(self.client, self.scene.start, self.dt_s, GLIDES[robot], self.scene.ground_height_m)
+        for ground in self._grounds:
+            pybullet.setCollisionFilterPair(loaded.body, ground, -1, -1, 0, physicsClientId=self.client)
         return loaded
 
     def _static(self, box: Box, friction: float) -> int:
@@ -169,13 +180,13 @@ class Simulation:
             solids[self._immovable(shape, (0, 0, 0), (0, 0, 0, 1), _SIDES)] = group
         return solids
 
-    def _raised(self, terrain: Terrain) -> None:
+    def _raised(self, terrain: Terrain) -> int:
         corners = np.array(terrain.vertices_m())
         middle = corners.mean(axis=0)
         shape = pybullet.createCollisionShape(
             pybullet.GEOM_MESH, vertices=(corners - middle).tolist(), physicsClientId=self.client
         )
-        self._immovable(shape, tuple(middle.tolist()), (0, 0, 0, 1), _FOOTING)
+        return self._immovable(shape, tuple(middle.tolist()), (0, 0, 0, 1), _FOOTING)
 
     def _immovable(self, shape: int, position: tuple[float, ...], turn: tuple[float, ...], friction: float) -> int:
         client = self.client

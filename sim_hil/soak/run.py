@@ -173,7 +173,7 @@ def run_legs(
         folder.mkdir(parents=True, exist_ok=True)
         scene = options.scenes[(number - 1) % len(options.scenes)]
         body = ROBOTS[options.robot].hil_robot
-        journey = Journey(load_scene(scene), options.seed, number, options.speed_mps, body)
+        journey = Journey(load_scene(scene), options.seed, number, options.speed_mps, body, options.people)
         stack = _stack_options(options, number, folder, scene, journey.begin(), faults=menu is not None)
         leg_options = LegOptions(number, options.seed, min(options.leg_s, left_s), options.speed_mps, stack)
         leg = Leg(leg_options, journey, menu, stopped=stopped, show_status=show_status)

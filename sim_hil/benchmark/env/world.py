@@ -34,13 +34,15 @@ class WorldOptions:
 
     `camera`: image size (width, height), px; None: no image. `drift`: none, typical or severe. `rate_hz`: physics steps
     a second, a multiple of 30. `linger_s`: time that the world continues after the goal was reached, s; the benchmark
-    uses 0, training observes whether the robot stays at the goal.
+    uses 0, training observes whether the robot stays at the goal. `glides`: the robot's stand-in without legs or wheels
+    drives (sim_hil/robots/gliding.py), for which 120 Hz are enough.
     """
 
     camera: tuple[int, int] | None = None
     drift: str = "none"
     rate_hz: int = 480  # under random commands the Go2 fell once in half an hour at 240 Hz, never in an hour at 480 Hz
     linger_s: float = 0.0
+    glides: bool = False
 
     def __post_init__(self) -> None:
         if self.camera is not None and not all(16 <= size <= MAX_PIXELS for size in self.camera):
@@ -77,6 +79,7 @@ class EpisodeWorld:
             robot=episode.robot,
             start=episode.start,
             rate_hz=self.options.rate_hz,
+            glides=self.options.glides,
         )
         try:
             self._simulation.settle()

@@ -40,7 +40,7 @@ _MISMATCH_SIGMA: Final = 0.002
 _TRACK_SIGMA: Final = 0.01
 
 
-def _towards(now: float, target: float, up: float, down: float) -> float:
+def towards(now: float, target: float, up: float, down: float) -> float:
     """Move `now` towards `target`: at most `up` away from zero, at most `down` towards zero, never across it."""
     if now * target < 0 or abs(target) < abs(now):
         low = max(abs(now) - down, abs(target) if now * target > 0 else 0.0)
@@ -94,8 +94,8 @@ class DriveController:
             self._left_steps -= 1
         dt = self._dt_s
         brake = ESTOP_MPS2 if self.estop else BRAKE_MPS2
-        v = _towards(self._v, v_target, ACCEL_MPS2 * dt, brake * dt)
-        w = _towards(self._w, w_target, ALPHA_RADPS2 * dt, ALPHA_RADPS2 * dt)
+        v = towards(self._v, v_target, ACCEL_MPS2 * dt, brake * dt)
+        w = towards(self._w, w_target, ALPHA_RADPS2 * dt, ALPHA_RADPS2 * dt)
         a, alpha = (v - self._v) / dt, (w - self._w) / dt
         if v == 0.0 == w and (self._v != 0.0 or self._w != 0.0):
             # Come to rest: a wheel that was pushing something must let go of it. The integral starts anew and holds the

@@ -32,6 +32,8 @@ _BEFORE_CRASH: Final = 20  # frames before a collision or fall that are discarde
 _POLICY_STUCK_S: Final = 15.0
 _EXPERT_STUCK_S: Final = 40.0  # longer than the policy's, because the expert waits for people
 _STUCK_M: Final = 0.5  # the robot is stuck if it stays within this distance for that time
+GLIDE_HZ: Final = 120
+"""Steps a second of a world whose robot glides: the least that `Simulation` takes."""
 _OFF_M: Final = 6.0  # a policy's drive ends at this distance from the route
 
 
@@ -80,7 +82,7 @@ class DrivePlan:
     `path` [n, 2]: the described route, m. With `policy_drives` a policy commands: its mistakes are recorded, until it
     is 6 m off the route or stuck for 15 s. The expert's drives end before a collision or fall; those farther than
     `off_m` from the route are rejected, because the instruction would not describe them. `linger_s`: recording after
-    arrival, s. `detour`: temporary departure from the route, if it is possible.
+    arrival, s. `detour`: temporary departure from the route, if it is possible. `legs`: as CollectConfig.legs.
     """
 
     episode: Episode
@@ -92,12 +94,19 @@ class DrivePlan:
     off_m: float = 4.0
     linger_s: float = 0.0
     detour: Detour | None = None
+    legs: bool = True
 
 
 def record(plan: DrivePlan, expert: ExpertPolicy, steer: Steer, trace_at: TraceAt) -> Recorded:
     """Drive and record. Raises NothingToLearnError if less than 3 s are usable, SceneError, ValueError."""
     frames = _Frames()
-    options = WorldOptions(camera=(plan.camera.render_px,) * 2, drift=plan.drift, linger_s=plan.linger_s)
+    options = WorldOptions(
+        camera=(plan.camera.render_px,) * 2,
+        drift=plan.drift,
+        linger_s=plan.linger_s,
+        rate_hz=WorldOptions.rate_hz if plan.legs else GLIDE_HZ,
+        glides=not plan.legs,
+    )
     first_collision: int | None = None
     with EpisodeWorld(plan.episode, options, scene=plan.scene) as world:
         try:

@@ -158,6 +158,7 @@ def _drive(order: Order, number: int, scenario: Scenario) -> Entry:
         policy_drives=order.policy is not None,
         linger_s=draw.linger_s,
         detour=detour,
+        legs=config.legs,
         off_m=DrivePlan.off_m + (0.0 if detour is None else detour.for_m),
     )
     rng = np.random.default_rng((order.seed, number, _TAG, 1))

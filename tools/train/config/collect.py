@@ -41,6 +41,9 @@ class CollectConfig(Checked):
     """Parallel processes; 0: one per core. Does not change the drives."""
     noise_share: Share = 0.3
     """Drives with bursts of steering noise."""
+    legs: bool = True
+    """Whether robots walk and roll under physics. Without, a stand-in glides with their measured response, and a drive
+    costs less (sim_hil/robots/gliding.py)."""
     sharp_share: Share = 0.3
     """Drives whose images are rendered at twice the size and reduced, which resembles a real camera."""
     jpeg_quality_min: Annotated[int, Range(30, 100)] = 80

@@ -46,14 +46,14 @@ def _tell(world: EpisodeWorld, chosen: NDArray[np.float64]) -> Mapping[str, Any]
 
 def _drive(
     steer: Steer, way: NDArray[np.float64] = WAY, camera: CameraSettings | None = None, linger_s: float = 0.0,
-    detour: Detour | None = None, **changes: Any,
+    detour: Detour | None = None, legs: bool = True, **changes: Any,
 ) -> Recorded:  # fmt: skip
     """Along the corridor; a policy's drive where `steer` is not the expert."""
     episode = corridor_episode(robot="carter", **changes)
     policy_drives = steer is not _expert_command
     plan = DrivePlan(
         episode, load_scene("corridor"), way, camera or CameraSettings(), "none", policy_drives=policy_drives,
-        linger_s=linger_s, detour=detour,
+        linger_s=linger_s, detour=detour, legs=legs,
     )  # fmt: skip
     return record(plan, ExpertPolicy(speed_mps=0.8, rests=True), steer, _tell)
 
@@ -101,6 +101,13 @@ def test_traces_are_recorded_once_a_second_in_order(reached: Recorded) -> None:
     times = [trace["at"] for trace in reached.traces]
     assert times == [float(second) for second in range(len(times))]
     assert len(times) == (len(reached.arrays["pose"]) - 1) // 10 + 1
+
+
+def test_a_drive_of_a_body_without_wheels_is_as_long_and_as_fast(reached: Recorded) -> None:
+    glided = _drive(_expert_command, legs=False)
+    assert glided.outcome == "reached" and not glided.collided
+    assert len(glided.arrays["pose"]) == pytest.approx(len(reached.arrays["pose"]), abs=3)
+    assert np.allclose(glided.arrays["state"][20:40], reached.arrays["state"][20:40], atol=0.03)
 
 
 def test_a_drive_off_the_described_route_is_rejected() -> None:
