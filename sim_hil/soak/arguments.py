@@ -25,11 +25,11 @@ UNTRAINED_MPS: Final = 0.14
 not end the run, so that the growth of the runner can be measured."""
 _UNITS_S: Final = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0}
 EXAMPLES = """examples:
-  edge-soak --artifacts out/nano --duration 1h --out out/soak
-  edge-soak --artifacts out/nano --duration 8h --leg 30m --people 12 --scene hospital --scene office --out out/night
+  edge-soak --artifacts out/nano --duration 2h --out out/soak
+  edge-soak --artifacts out/nano --duration 8h --people 12 --scene hospital --scene office --out out/night
   edge-soak --artifacts out/nano --duration 8h --out out/night --resume      # with the same options, after a kill
   edge-soak --artifacts out/nano --duration 5m --faults none --json - --out out/quick
-  edge-soak --artifacts out/nano --duration 1h --robot carter-can --out out/carter
+  edge-soak --artifacts out/nano --duration 2h --robot carter-can --out out/carter
 
 A leg is one run of the stack (edge-hil, edge-bridge, edge-run) in one scene, with one task after another.
 Default budget and faults: sim_hil/soak/budget.toml and sim_hil/soak/faults.toml; copy and change them. Only the go2
@@ -68,7 +68,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--seed", type=int, default=0, metavar="N", help="random seed of tasks, people and faults (default 0)"
     )
-    p.add_argument("--leg", type=parse_seconds, default=1200.0, metavar="T", help="length of a leg (default 20m)")
+    p.add_argument("--leg", type=parse_seconds, default=7200.0, metavar="T", help="length of a leg (default 2h)")
     p.add_argument("--mode", choices=MODES, default="async", help="reasoning mode of edge-run (default async)")
     p.add_argument("--release-delay", default="0", metavar="S|PROFILE", help="release delay of edge-run (default 0)")
     p.add_argument(

@@ -107,10 +107,10 @@ def _budget_line(table: Table) -> BudgetLine:
     return line
 
 
-WARM_UP_S: Final = 300.0
-"""Warm-up of a process, s, in which caches, histories and arenas fill (nano, 2 cores: of the runner's 279 MiB after
-5 min, 12 MiB came in the first minute, 4 MiB in the next four, 0.2 MiB in the last)."""
-SHORTEST_S: Final = 240.0
+WARM_UP_S: Final = 3600.0
+"""Warm-up of a process, s, in which caches, histories and arenas fill (nano, 2 cores: the runner's growth was 5.6 MiB/h
+over minutes 5 to 15, 2.6 over minutes 15 to 36, 2.0 over the last six of these)."""
+SHORTEST_S: Final = 1800.0
 """Least time after the warm-up for a meaningful slope per hour, s."""
 BLOCK_S: Final = 10.0
 """Length of a block of samples that is reduced to its median, s."""

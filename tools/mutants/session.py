@@ -22,8 +22,8 @@ KILLED, SURVIVED, TIMEOUT, UNREACHED = "killed", "survived", "timeout", "unreach
 FAILED: Final = "this tool failed"
 _RESULTS: Final = {0: SURVIVED, 1: KILLED, 2: FAILED}
 """Exit code of the process of a mutant; one that is killed by a signal has crashed in the test."""
-_LEAST_S: Final = 20.0
-"""Time limit of a mutant, above ten times what its tests need without a change."""
+_LEAST_S: Final = 10.0
+"""Time limit of one test of a mutant, above ten times what it needs without a change."""
 _POLL_S: Final = 0.002
 
 
@@ -102,25 +102,33 @@ class MutantSession:
     def _run(self, session: pytest.Session, target: object, mutant: Mutant, tests: list[_Timed]) -> str:
         sys.stdout.flush()
         sys.stderr.flush()
+        reading, writing = os.pipe()
         child = os.fork()
         if child == 0:
-            self._try(session, target, mutant, tests)
-        end_ns = time.monotonic_ns() + round((_LEAST_S + 10 * sum(test.took_s for test in tests)) * 1e9)
-        ended = status = 0
+            self._try(session, target, mutant, tests, writing)
+        os.close(writing)
+        os.set_blocking(reading, False)
+        ended, waiting = 0, iter(tests)
+        end_ns = time.monotonic_ns() + round(_LEAST_S * 1e9)
         try:
-            while time.monotonic_ns() < end_ns:
+            while True:
                 ended, status = os.waitpid(child, os.WNOHANG)
                 if ended:
                     return _RESULTS.get(os.waitstatus_to_exitcode(status), KILLED)
+                now_ns = time.monotonic_ns()
+                if _has_begun(reading):
+                    end_ns = now_ns + round((_LEAST_S + 10 * next(waiting).took_s) * 1e9)
+                elif now_ns > end_ns:
+                    return TIMEOUT
                 time.sleep(_POLL_S)
-            return TIMEOUT
         finally:
+            os.close(reading)
             if not ended:
                 os.kill(child, signal.SIGKILL)
                 os.waitpid(child, 0)
 
-    def _try(self, session: pytest.Session, target: object, mutant: Mutant, tests: list[_Timed]) -> None:
-        """In the child: ends it with 0 when every test passes."""
+    def _try(self, session: pytest.Session, target: object, mutant: Mutant, tests: list[_Timed], writing: int) -> None:
+        """In the child: ends it with 0 when every test passes; says through a pipe that a test begins."""
         os.setsid()
         code = 2
         try:
@@ -130,6 +138,7 @@ class MutantSession:
             graft(sys.modules[self.module], mutant)
             code = 0
             for test in tests:
+                os.write(writing, b".")
                 test.item.config.hook.pytest_runtest_protocol(item=test.item, nextitem=session)
                 if self._failed:
                     code = 1
@@ -138,6 +147,14 @@ class MutantSession:
             code = 1
         finally:
             os._exit(code)
+
+
+def _has_begun(reading: int) -> bool:
+    """Whether the child has begun one more test."""
+    try:
+        return os.read(reading, 1) == b"."
+    except BlockingIOError:
+        return False
 
 
 def _in_function(target: object, mutant: Mutant) -> bool:

@@ -30,7 +30,7 @@ from sim_hil.soak.verdict import (
 LIMIT = BudgetLine("x", "here", max=1.0)
 
 
-def grown(per_h: float, seconds: int = 1200, noise: float = 0.0) -> tuple[list[float], list[float]]:
+def grown(per_h: float, seconds: int = 7200, noise: float = 0.0) -> tuple[list[float], list[float]]:
     times = [float(t) for t in range(seconds)]
     rng = np.random.default_rng(5)
     return times, [100.0 + per_h * t / 3600 + float(rng.normal(0, noise)) for t in times]
@@ -60,7 +60,7 @@ def test_spikes_do_not_move_a_slope() -> None:
 
 
 def test_a_short_life_has_no_slope() -> None:
-    assert slope(*grown(12.0, seconds=500)) is None
+    assert slope(*grown(12.0, seconds=5000)) is None
 
 
 def test_within_the_limit_passes_and_beyond_it_fails() -> None:
@@ -104,7 +104,7 @@ def test_a_soak_without_measurements_is_undecided_with_exit_code_1(
     assert "no data: memory_slope_mib_per_h.edge-run, " in capsys.readouterr().err
     page = write_report(soak, result).read_text(encoding="utf-8")
     assert '<span class="verdict bad">UNDECIDED</span>' in page
-    assert "no verdict: 12 of 12 budget lines are undecided" in page
+    assert "no verdict: 13 of 13 budget lines are undecided" in page
 
 
 @pytest.mark.parametrize(
@@ -165,7 +165,7 @@ def sample(t: float, rss_mib: float, pid: int = 7) -> dict[str, object]:
 
 def test_a_leaking_runner_fails_and_a_steady_one_passes() -> None:
     for growth, wanted in ((3.0, FAIL), (0.1, PASS)):
-        leg = [sample(float(t), 250 + growth * t / 3600) for t in range(1200)]
+        leg = [sample(float(t), 250 + growth * t / 3600) for t in range(5500)]
         lines = {line.measure: line for line in load_budget(DEFAULT_BUDGET)}
         found = measures([], [leg])
         for name, verdict in (("memory_slope_mib_per_h.edge-run", wanted), ("descriptor_slope_per_h.edge-run", PASS)):
@@ -174,6 +174,6 @@ def test_a_leaking_runner_fails_and_a_steady_one_passes() -> None:
 
 def test_every_process_has_a_life_of_its_own() -> None:
     """A runner that is started anew at another size has not grown."""
-    leg = [sample(float(t), 250, 7) for t in range(1200)] + [sample(1200.0 + t, 300, 8) for t in range(1200)]
+    leg = [sample(float(t), 250, 7) for t in range(5500)] + [sample(5500.0 + t, 300, 8) for t in range(5500)]
     found = measures([], [leg])["memory_slope_mib_per_h.edge-run"]
     assert found.value == pytest.approx(0.0, abs=1e-6) and found.count == 2
