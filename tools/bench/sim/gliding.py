@@ -137,11 +137,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         return bad_input("gliding", ValueError(f"{expected}, found {args.seconds:g} and {args.seed}"))
     rows = [measure(robot, args.seconds, args.seed) for robot in GLIDES]
     for row in rows:
-        after = ", ".join(
-            f"{row[f'apart_m_after_{s:g}_s']['p50']:.3f} m and {row[f'apart_rad_after_{s:g}_s']['p50']:.3f} rad in {s:g} s"
-            for s in HORIZONS_S
+        parts = []
+        for seconds in HORIZONS_S:
+            gap, turn = (row[f"apart_{unit}_after_{seconds:g}_s"]["p50"] for unit in ("m", "rad"))
+            parts.append(f"{gap:.3f} m and {turn:.3f} rad after {seconds:g} s")
+        apart_by = ", ".join(parts)
+        sys.stdout.write(
+            f"{row['robot']}: apart by {apart_by} (medians); processor time {row['ratio']:.1f} times less\n"
         )
-        sys.stdout.write(f"{row['robot']}: apart by {after} (medians); processor time {row['ratio']:.1f} times less\n")
     write_result(args.json, {"rows": rows})
     return EXIT_DONE
 
