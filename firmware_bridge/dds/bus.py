@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import struct
+import threading
 from collections.abc import Iterator
 from typing import Any, Final
 
@@ -64,6 +65,7 @@ class Bus:
                 f" {config.participants} programs on this machine use the domain (dds.participants)"
             ) from error
         self._topics: dict[str, Topic[Any]] = {}
+        self._topics_lock = threading.Lock()  # a camera's thread may come for the same topic as another
 
     def reader(
         self, name: str, kind: Any, *, depth: int = 1, reliable: bool = False, foreign: bool = False
@@ -100,9 +102,10 @@ class Bus:
         self._domain._delete(self._domain._ref)
 
     def _topic(self, name: str, kind: Any) -> Topic[Any]:
-        if name not in self._topics:
-            self._topics[name] = Topic(self.participant, name, kind)
-        return self._topics[name]
+        with self._topics_lock:
+            if name not in self._topics:
+                self._topics[name] = Topic(self.participant, name, kind)
+            return self._topics[name]
 
 
 def take_bytes(reader: DataReader[Any], limit: int = 64) -> Iterator[tuple[bytes, Any]]:

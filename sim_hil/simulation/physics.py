@@ -54,8 +54,8 @@ class Simulation:
     """Deterministic world: the same scene, people, seed, rate and calls give the same motion, step for step.
 
     `start` (x m, y m, heading rad) replaces the scene's. `gui` shows the physics in a window (needs a display).
-    `glides`: the robot's stand-in without legs or wheels (sim_hil/robots/gliding.py). Raises ValueError for an unknown
-    robot, or if the scene has no room or no routes for that many people.
+    `glides`: the robot's stand-in without legs or wheels (sim_hil/simulation/gliding.py). Raises ValueError for an
+    unknown robot, or if the scene has no room or no routes for that many people.
     """
 
     DT_S = 0.002  # of the default rate, which real time runs at
@@ -149,7 +149,7 @@ class Simulation:
         return loaded
 
     def _load_gliding(self, robot: str) -> Robot:
-        from sim_hil.robots.gliding import GLIDES, GlidingRobot
+        from sim_hil.simulation.gliding import GLIDES, GlidingRobot
 
         loaded = GlidingRobot(self.client, self.scene.start, self.dt_s, GLIDES[robot], self.scene.ground_height_m)
         for ground in self._grounds:

@@ -35,7 +35,7 @@ class WorldOptions:
     `camera`: image size (width, height), px; None: no image. `drift`: none, typical or severe. `rate_hz`: physics steps
     a second, a multiple of 30. `linger_s`: time that the world continues after the goal was reached, s; the benchmark
     uses 0, training observes whether the robot stays at the goal. `glides`: the robot's stand-in without legs or wheels
-    drives (sim_hil/robots/gliding.py), for which 120 Hz are enough.
+    drives (sim_hil/simulation/gliding.py), for which 120 Hz are enough.
     """
 
     camera: tuple[int, int] | None = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 
 import cv2
@@ -17,6 +18,7 @@ from edge.cameras.ros2_pictures import compressed_picture, raw_picture
 from edge.run.camera import decode_frame
 from firmware_bridge.core.config import ConfigError, DdsConfig
 from firmware_bridge.core.robot_state import CameraError
+from firmware_bridge.dds import bus as bus_module
 from firmware_bridge.dds.bus import Bus
 from firmware_bridge.dds.shared_bus import SharedBus
 from firmware_bridge.ros2.messages.common import Header_, Time_
@@ -160,6 +162,23 @@ def test_only_the_newest_picture_is_returned_and_once(shared: SharedBus) -> None
         assert int(decode_frame(camera.request_frame(1.0), 64)[0, 32, 32, 0]) == pytest.approx(250, abs=6)
         with pytest.raises(CameraError, match=r"camera ros2:/image: no new picture within 50 ms"):
             camera.request_frame(0.05)
+
+
+def test_two_threads_that_come_for_one_topic_at_once_share_it(
+    shared: SharedBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = []
+
+    def slow_topic(_participant: object, name: str, _kind: object) -> str:
+        time.sleep(0.05)
+        made.append(name)
+        return name
+
+    monkeypatch.setattr(bus_module, "Topic", slow_topic)
+    bus = shared.open()
+    with ThreadPoolExecutor(4) as threads:
+        topics = list(threads.map(lambda _: bus._topic("rt/image_raw", Image_), range(4)))
+    assert topics == ["rt/image_raw"] * 4 and made == ["rt/image_raw"]
 
 
 def test_a_raw_topic_gives_jpegs(shared: SharedBus) -> None:

@@ -1,4 +1,4 @@
-"""How near a gliding stand-in comes to its robot, and what it saves (`sim_hil/robots/gliding.py`).
+"""How near a gliding stand-in comes to its robot, and what it saves (`sim_hil/simulation/gliding.py`).
 
     python -m tools.bench.sim.gliding --json out/bench/gliding.json
 
@@ -10,6 +10,7 @@ arguments.
 
 from __future__ import annotations
 
+import argparse
 import sys
 import time
 from collections.abc import Sequence
@@ -20,13 +21,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.core.cli import EXIT_DONE, check_result_target, command_line, write_result
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, check_result_target, command_line, write_result
 from edge.core.geometry import SE2
 from edge.core.stats import percentiles
-from sim_hil.robots.gliding import GLIDES
+from firmware_bridge.system.terminal import CommandParser
 from sim_hil.scene.scene import Scene
+from sim_hil.simulation.gliding import GLIDES
 from sim_hil.simulation.physics import Simulation
-from tools.bench import bad_input, command_parser
 
 Array = NDArray[np.float64]
 
@@ -127,14 +128,16 @@ def measure(robot: str, seconds: float, seed: int) -> dict[str, Any]:
 @command_line("gliding")
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the benchmark; returns its exit code."""
-    p = command_parser(__doc__)
+    p = CommandParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument("--seconds", type=float, default=120.0, metavar="S", help="simulated time (default 120)")
     p.add_argument("--seed", type=int, default=0, metavar="N", help="of the commands (default 0)")
+    p.add_argument("--json", metavar="FILE|-", help="write the figures as JSON")
     args = p.parse_args(argv)
     check_result_target(args.json)
     if not 10 <= args.seconds <= 3600 or args.seed < 0:
         expected = "expected --seconds 10 to 3600 and --seed 0 or more"
-        return bad_input("gliding", ValueError(f"{expected}, found {args.seconds:g} and {args.seed}"))
+        sys.stderr.write(f"gliding: {expected}, found {args.seconds:g} and {args.seed}\n")
+        return EXIT_BAD_INPUT
     rows = [measure(robot, args.seconds, args.seed) for robot in GLIDES]
     for row in rows:
         parts = []

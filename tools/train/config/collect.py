@@ -43,7 +43,7 @@ class CollectConfig(Checked):
     """Drives with bursts of steering noise."""
     legs: bool = True
     """Whether robots walk and roll under physics. Without, a stand-in glides with their measured response, and a drive
-    costs less (sim_hil/robots/gliding.py)."""
+    costs less (sim_hil/simulation/gliding.py)."""
     sharp_share: Share = 0.3
     """Drives whose images are rendered at twice the size and reduced, which resembles a real camera."""
     jpeg_quality_min: Annotated[int, Range(30, 100)] = 80

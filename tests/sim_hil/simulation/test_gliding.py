@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim_hil.robots.gliding import GLIDES
 from sim_hil.scene.scene import Scene, Terrain, load_scene
 from sim_hil.simulation.camera import MOUNTS
+from sim_hil.simulation.gliding import GLIDES
 from sim_hil.simulation.physics import Simulation
 from tests.support.benchmark.benchmark_episodes import block, hall
 from tools.bench.sim.gliding import apart, commands, drive
