@@ -262,6 +262,6 @@ def test_after_an_emergency_stop_nothing_moves_the_robot_without_an_operator() -
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_the_same_over_a_hundred_thousand_steps() -> None:
-    run(1_200)
-    assert BridgeMachine.rules_run >= 100_000
-    assert BridgeMachine.latched_runs > 20_000 and BridgeMachine.drives > 1_000
+    run(400)
+    assert World.core_steps >= 100_000 and BridgeMachine.rules_run >= 35_000
+    assert BridgeMachine.latched_runs > 6_000 and BridgeMachine.drives > 300
