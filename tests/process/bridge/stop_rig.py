@@ -37,7 +37,7 @@ class Peer(Bus):
 
     def __init__(self, domain: int) -> None:
         self.participant = DomainParticipant(domain)
-        self._topics = {}
+        self._topics, self._topics_lock = {}, threading.Lock()
 
     def close(self) -> None:
         """Leave the domain now; its publishers are announced as gone."""

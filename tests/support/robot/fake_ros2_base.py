@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 from typing import Any
 
@@ -29,7 +30,7 @@ def second_bus(domain: int) -> Bus:
     """Another participant in a domain that this process has already opened; end it with `leave`."""
     bus = object.__new__(Bus)
     bus.participant = DomainParticipant(domain)
-    bus._topics = {}
+    bus._topics, bus._topics_lock = {}, threading.Lock()
     return bus
 
 
