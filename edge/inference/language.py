@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -128,6 +129,7 @@ class LanguageModel:
         self._kv = np.zeros((1, runtime.max_context, runtime.kv_dim), dtype=np.float32)
         self._took_ns: dict[int, int] = {}
         self._graphs, self._buffers = graphs, buffers
+        self.background: AbstractContextManager[None] = nullcontext()  # around every call of a graph
         self.rows: tuple[int, ...] = (LEAST_ROWS,)
         """Permitted numbers of rows of a call that chooses tokens, ascending."""
         self.kept_ids: tuple[int, ...] = ()
@@ -138,10 +140,7 @@ class LanguageModel:
         """Return whether a token's text ends a line."""
 
     def check_instruction(self, instruction: str) -> None:
-        """Raise InstructionError unless a prompt with all frames and a full answer fit the model's context.
-
-        The check uses the longest prompt: all points of a far path, and a long progress.
-        """
+        """Raise InstructionError unless its longest prompt and a full answer fit the model's context."""
         frames = range(len(self.runtime.frame_offsets_s))
         filler = [EncodedFrame(i, SE2(0.0, 0.0, 0.0), self.no_frame) for i in frames]
         prompt = self.prompt.build(filler, instruction, LONGEST_PAST_PATH, LONGEST_BEFORE)
@@ -227,7 +226,8 @@ class LanguageModel:
         """Feed a chunk after `past` tokens; return what `Call` does. Raises GraphError."""
         self.kept_ids = self.kept_ids[:past]
         started_ns = time.monotonic_ns()
-        next_ids = call(chunk, past, self._kv, interrupt)
+        with self.background:
+            next_ids = call(chunk, past, self._kv, interrupt)
         if not all(0 <= token < MAX_TOKENS for token in next_ids):
             raise GraphError(f"the language model's next tokens are {next_ids}, expected ids of its vocabulary")
         self._took_ns[len(chunk.ids)] = time.monotonic_ns() - started_ns

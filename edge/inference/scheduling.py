@@ -27,11 +27,14 @@ REASONING_NICENESS = 10
 SPARE_CORES = 1
 """Cores left to camera, odometry and recorder before reasoning's threads are pinned; with fewer, the operating system
 distributes the cores better."""
+SERVICE_STEPS = 10
+"""How far below the control thread's real-time priority the other Python threads are."""
 ROUND_NS = 1_000_000
 """Period at which a waiting reasoning thread checks again, ns."""
 GAP_NS = 2_000_000
 """Time after a call for which its tick still counts as under way: between its two calls, and after them."""
 
+_FIFO = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK  # processes that such a thread starts are ordinary ones
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # linux/mman.h
 
 
@@ -160,6 +163,54 @@ def enter(role: Role, calls: ThreadCalls | None = None) -> list[str]:
         with contextlib.suppress(OSError):
             calls.set_niceness(role.niceness)
     return lines
+
+
+def service_priority(control: Role) -> int | None:
+    """Return the priority of SCHED_FIFO for Python threads beside the control thread; None: it has none itself."""
+    return None if control.priority is None else max(1, control.priority - SERVICE_STEPS)
+
+
+def protect_interpreter(control: Role) -> None:
+    """Give the Python threads that live now a real-time priority; where that is refused, nothing changes.
+
+    A thread that holds the interpreter's lock, or is to take it next, must not wait for other programs: the control
+    thread would wait with it (measured beside two busy programs on 2 cores: for more than 250 ms, every 20 s).
+    """
+    priority = service_priority(control)
+    for thread in threading.enumerate():
+        if priority is not None and thread.native_id is not None:
+            with contextlib.suppress(OSError):
+                os.sched_setscheduler(thread.native_id, _FIFO, os.sched_param(priority))
+
+
+def prepare_process(control: Role) -> list[str]:
+    """Prepare for driving, once everything that lives as long as the process exists; return lines for the operator."""
+    refused = lock_memory()
+    freeze_garbage()
+    protect_interpreter(control)
+    return [] if refused is None else [refused]
+
+
+class Background:
+    """A thread's calls of long graphs: inside the block it has ordinary priority, outside it that of the interpreter.
+
+    Made by the thread that uses it, after its role has been set. Without permission it changes nothing.
+    """
+
+    def __init__(self, priority: int | None) -> None:
+        self._priority = priority
+        try:
+            self.__exit__()
+        except OSError:
+            self._priority = None
+
+    def __enter__(self) -> None:
+        if self._priority is not None:
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+    def __exit__(self, *_: object) -> None:
+        if self._priority is not None:
+            os.sched_setscheduler(0, _FIFO, os.sched_param(self._priority))
 
 
 def run_as(role: Role | None, body: Callable[[], Result]) -> Result:

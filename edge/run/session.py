@@ -19,7 +19,7 @@ from edge.flightlog.recorder import Recorder, space_refusal
 from edge.flightlog.records import RecordSinks
 from edge.inference.graph import GraphError
 from edge.inference.language import ContextOverflowError
-from edge.inference.scheduling import TickActivity, enter, freeze_garbage, lock_memory, schedule_for
+from edge.inference.scheduling import TickActivity, enter, prepare_process, schedule_for
 from edge.inference.start_guard import WARM_UP_S
 from edge.inference.warm_up import check_tick, open_proven, warm_up
 from edge.reasoning.generation_cycle import Mode
@@ -181,10 +181,7 @@ class RunSession:
             say, live = self._lines.append, views.live
             channel = open_channels(self._options, self._robot, self._bus, check, by_phrase, say, live)
             loops.power.start()
-            # After everything that lives as long as the process has been made.
-            if (refused := lock_memory()) is not None:
-                self._lines.append(refused)
-            freeze_garbage()
+            self._lines.extend(prepare_process(self._schedule.control))
             loops.control.last_seq = self._arm(bridge, loops, channel)
             self._print(f"armed and driving {self._robot.name}: {self._options.instruction}")
             started_ns = time.monotonic_ns()

@@ -11,6 +11,7 @@ import pytest
 
 import firmware_bridge
 from edge.inference.release import ReleaseDelay
+from edge.inference.scheduling import Role
 from edge.motion.controller import Controller, ControllerConfig
 from edge.reasoning.generation_cycle import Mode
 from edge.run import assembly, robot_inputs
@@ -46,7 +47,7 @@ def test_its_limits_reach_the_controller_and_the_monitor_of_the_policys_output(
     policy = SimpleNamespace(tokens_shape=(1, 4, 8), artifacts=artifacts)
     engines: Any = SimpleNamespace(
         artifacts=artifacts, policy=policy, language=None, activity=None,
-        schedule=SimpleNamespace(shared=False, reasoning=None),
+        schedule=SimpleNamespace(shared=False, reasoning=None, control=Role("control")),
     )  # fmt: skip
     reader = SimpleNamespace(state=None, malformed=0)
     inputs: Any = SimpleNamespace(
