@@ -174,7 +174,7 @@ def protect_interpreter(control: Role) -> None:
     """Give the Python threads that live now a real-time priority; where that is refused, nothing changes.
 
     A thread that holds the interpreter's lock, or is to take it next, must not wait for other programs: the control
-    thread would wait with it (measured beside two busy programs on 2 cores: for more than 250 ms, every 20 s).
+    thread would wait with it (measured beside two busy programs on 2 cores: twice a minute for more than 250 ms).
     """
     priority = service_priority(control)
     for thread in threading.enumerate():
