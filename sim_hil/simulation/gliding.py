@@ -1,8 +1,8 @@
 """A body that glides on the floor with the measured response of the robot that it stands for.
 
-Legs and wheels cost half of a drive's processor time and add nothing to a picture. Walls and people stop this body as
-they stop the robot; it cannot fall, and it takes kerbs and ramps without effort. For training data: the benchmark's
-robots walk and roll (how near it comes: `python -m tools.bench.sim.gliding`).
+Legs and wheels cost a quarter of a drive's processor time and add nothing to a picture. Walls and people stop this
+body as they stop the robot; it cannot fall, and it takes kerbs and ramps without effort. For training data: the
+benchmark's robots walk and roll (how near it comes: `python -m tools.bench.sim.gliding`).
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ class GlidingRobot:
         glide, dt_s = self._glide, self._dt_s
         wanted = self._commanded
         self._held = max(self._held - 1, 0)
-        self._reference = vx, vy, wz = _vec(
+        self._reference = _vec(
             carter_drive.towards(now, target, up * dt_s, down * dt_s)
             for now, target, up, down in zip(self._reference, wanted, glide.accel, glide.brake, strict=True)
         )
@@ -162,7 +162,7 @@ class GlidingRobot:
         )
 
     def observe(self) -> None:
-        """Read the body after a step; what a wall has taken away of the velocity is lost."""
+        """Read the body after a step."""
         self._centre, (_, _, z, w) = pybullet.getBasePositionAndOrientation(self.body, physicsClientId=self._client)
         self._heading = 2.0 * atan2(z, w)
         self._steps += 1
