@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -129,7 +128,6 @@ class LanguageModel:
         self._kv = np.zeros((1, runtime.max_context, runtime.kv_dim), dtype=np.float32)
         self._took_ns: dict[int, int] = {}
         self._graphs, self._buffers = graphs, buffers
-        self.background: AbstractContextManager[None] = nullcontext()  # around every call of a graph
         self.rows: tuple[int, ...] = (LEAST_ROWS,)
         """Permitted numbers of rows of a call that chooses tokens, ascending."""
         self.kept_ids: tuple[int, ...] = ()
@@ -226,8 +224,7 @@ class LanguageModel:
         """Feed a chunk after `past` tokens; return what `Call` does. Raises GraphError."""
         self.kept_ids = self.kept_ids[:past]
         started_ns = time.monotonic_ns()
-        with self.background:
-            next_ids = call(chunk, past, self._kv, interrupt)
+        next_ids = call(chunk, past, self._kv, interrupt)
         if not all(0 <= token < MAX_TOKENS for token in next_ids):
             raise GraphError(f"the language model's next tokens are {next_ids}, expected ids of its vocabulary")
         self._took_ns[len(chunk.ids)] = time.monotonic_ns() - started_ns

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
 from typing import cast
 
 import numpy as np
@@ -68,7 +67,6 @@ class Policy:
         }
         self._acting.bind_ortvalue_output("trajectory", ort.OrtValue.ortvalue_from_numpy(self._trajectory))
         self._bound: Context | None = None
-        self.background: AbstractContextManager[None] = nullcontext()  # around every call of the semantic context
 
     def encode(self, frame: npt.NDArray[np.uint8], out: FloatArray | None = None) -> FloatArray:
         """Encode a frame [1, px, px, 3] to visual tokens [1, N, D] (every new frame, control thread).
@@ -95,8 +93,7 @@ class Policy:
 
     def make_context(self, feeds: Context, interrupt: Interrupt | None = None) -> Context:
         """Run the semantic context's graph on its input by name: K‖V or waypoints."""
-        with self.background:
-            outputs = self._context.run(feeds, interrupt=interrupt)
+        outputs = self._context.run(feeds, interrupt=interrupt)
         return dict(zip(self._context.output_names, outputs, strict=True))
 
     def act(

@@ -27,8 +27,8 @@ REASONING_NICENESS = 10
 SPARE_CORES = 1
 """Cores left to camera, odometry and recorder before reasoning's threads are pinned; with fewer, the operating system
 distributes the cores better."""
-SERVICE_STEPS = 10
-"""How far below the control thread's real-time priority the other Python threads are."""
+PRIORITY_STEPS = 10
+"""Distance in real-time priority from the control thread to the other Python threads, and from them to reasoning."""
 ROUND_NS = 1_000_000
 """Period at which a waiting reasoning thread checks again, ns."""
 GAP_NS = 2_000_000
@@ -167,50 +167,37 @@ def enter(role: Role, calls: ThreadCalls | None = None) -> list[str]:
 
 def service_priority(control: Role) -> int | None:
     """Return the priority of SCHED_FIFO for Python threads beside the control thread; None: it has none itself."""
-    return None if control.priority is None else max(1, control.priority - SERVICE_STEPS)
+    return None if control.priority is None else max(1, control.priority - PRIORITY_STEPS)
 
 
-def protect_interpreter(control: Role) -> None:
-    """Give the Python threads that live now a real-time priority; where that is refused, nothing changes.
+def reasoning_priority(control: Role) -> int | None:
+    """Return the priority of SCHED_FIFO for the reasoning thread, the last of all; None: the control thread has none.
 
-    A thread that holds the interpreter's lock, or is to take it next, must not wait for other programs: the control
-    thread would wait with it (measured beside two busy programs on 2 cores: twice a minute for more than 250 ms).
+    Its graphs' own threads keep ordinary scheduling.
     """
-    priority = service_priority(control)
-    for thread in threading.enumerate():
-        if priority is not None and thread.native_id is not None:
-            with contextlib.suppress(OSError):
-                os.sched_setscheduler(thread.native_id, _FIFO, os.sched_param(priority))
+    return None if control.priority is None else max(1, control.priority - 2 * PRIORITY_STEPS)
+
+
+def raise_priority(thread: int, priority: int | None) -> None:
+    """Give a thread (0: the caller) this priority of SCHED_FIFO; without permission or priority nothing changes.
+
+    Every thread that takes the interpreter's lock needs one: an ordinary thread that the kernel has set aside keeps
+    the lock, or its turn to take it, and the control thread waits. Beside two busy programs on 2 cores ordinary
+    threads waited up to 0.6 s, whatever their niceness.
+    """
+    if priority is not None:
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(thread, _FIFO, os.sched_param(priority))
 
 
 def prepare_process(control: Role) -> list[str]:
     """Prepare for driving, once everything that lives as long as the process exists; return lines for the operator."""
     refused = lock_memory()
     freeze_garbage()
-    protect_interpreter(control)
+    for thread in threading.enumerate():
+        if thread.native_id is not None:
+            raise_priority(thread.native_id, service_priority(control))
     return [] if refused is None else [refused]
-
-
-class Background:
-    """A thread's calls of long graphs: inside the block it has ordinary priority, outside it that of the interpreter.
-
-    Made by the thread that uses it, after its role has been set. Without permission it changes nothing.
-    """
-
-    def __init__(self, priority: int | None) -> None:
-        self._priority = priority
-        try:
-            self.__exit__()
-        except OSError:
-            self._priority = None
-
-    def __enter__(self) -> None:
-        if self._priority is not None:
-            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-
-    def __exit__(self, *_: object) -> None:
-        if self._priority is not None:
-            os.sched_setscheduler(0, _FIFO, os.sched_param(self._priority))
 
 
 def run_as(role: Role | None, body: Callable[[], Result]) -> Result:

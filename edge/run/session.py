@@ -19,7 +19,7 @@ from edge.flightlog.recorder import Recorder, space_refusal
 from edge.flightlog.records import RecordSinks
 from edge.inference.graph import GraphError
 from edge.inference.language import ContextOverflowError
-from edge.inference.scheduling import TickActivity, enter, prepare_process, schedule_for
+from edge.inference.scheduling import Role, TickActivity, enter, prepare_process, run_as, schedule_for, service_priority
 from edge.inference.start_guard import WARM_UP_S
 from edge.inference.warm_up import check_tick, open_proven, warm_up
 from edge.reasoning.generation_cycle import Mode
@@ -148,14 +148,18 @@ class RunSession:
         end: Deadline | None = None
         try:
             sink = CommandTap(bridge)
-            inputs = RobotInputs(
-                self._robot,
-                image_px=self._artifacts.runtime.image_px,
-                period_ns=self._period_ns,
-                commanded=lambda: sink.commanded,
-                say=self._lines.append,
-                on_death=self._end_by,
-                bus=self._bus,
+            # The threads of a protocol's library inherit the priority, so that poses and pictures do not wait either.
+            inputs = run_as(
+                Role("inputs", priority=service_priority(self._schedule.control)),
+                lambda: RobotInputs(
+                    self._robot,
+                    image_px=self._artifacts.runtime.image_px,
+                    period_ns=self._period_ns,
+                    commanded=lambda: sink.commanded,
+                    say=self._lines.append,
+                    on_death=self._end_by,
+                    bus=self._bus,
+                ),
             )
             inputs.camera.start()
             self._await_inputs(inputs, bridge)

@@ -32,6 +32,11 @@ COMMANDS: Mapping[str, Sequence[str]] = {
     "edge-run": (sys.executable, "-m", "edge.run.command"),
 }
 
+ROBOT_PRIORITY = 20
+"""Real-time priority of the robot's side where permitted, above ordinary programs and below the runner's threads.
+
+A robot has a computer of its own: what else runs on this one must not slow it.
+"""
 READY_TIMEOUT_S = 120.0
 BRIDGE_TIMEOUT_S = 30.0
 GRACE_S = 12.0
@@ -144,7 +149,7 @@ class Stack:
         faults = self._sockets / "faults"
         if options.faults:
             command += ["--faults", str(faults)]
-        robot = self.robot = self._children.start("edge-hil", command)
+        robot = self.robot = self._children.start("edge-hil", command, fifo_priority=ROBOT_PRIORITY)
         ready = lambda: READY_LINE in _text(robot.log)  # noqa: E731 - one line, used once
         self._children.wait_until(robot, ready, READY_TIMEOUT_S, "ready line", tick)
         if options.faults:

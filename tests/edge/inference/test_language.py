@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from contextlib import AbstractContextManager
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from hypothesis import strategies as st
 from edge.artifacts.manifest import Artifacts, load_artifacts
 from edge.core.geometry import SE2
 from edge.inference.calls import Chunk, chunks, set_last_apart
-from edge.inference.graph import CancelledError, Graph, Interrupt
+from edge.inference.graph import CancelledError, Interrupt
 from edge.inference.language import ContextOverflowError, LanguageModel
 from edge.reasoning.prompt import Segment
 from edge.state.ring import EncodedFrame
@@ -87,29 +86,6 @@ def test_any_chunk_length_gives_the_same_answer(
     generation = language.generate(segments, max_new_tokens=12, cancelled=lambda: False)
     np.testing.assert_allclose(generation.last_layer_kv, expected[0], atol=2e-4)
     assert generation.token_ids == expected[1]
-
-
-def test_every_call_of_a_graph_is_in_the_background_and_nothing_else(artifacts: Artifacts) -> None:
-    language = model(artifacts, 16)
-    inside, calls = [False], []
-
-    class Background(AbstractContextManager[None]):
-        def __enter__(self) -> None:
-            inside[0] = True
-
-        def __exit__(self, *_: object) -> None:
-            inside[0] = False
-
-    def cancelled() -> bool:
-        assert not inside[0]
-        return False
-
-    language.background = Background()
-    run_bound = Graph.run_bound
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Graph, "run_bound", lambda *args: (calls.append(inside[0]), run_bound(*args))[1])
-        language.generate(language.prompt.build(frames(2, 64, 256), SENTENCE), max_new_tokens=4, cancelled=cancelled)
-    assert len(calls) > 5 and all(calls)
 
 
 @pytest.mark.parametrize("directory", ["artifacts", pytest.param("pair", marks=pytest.mark.slow)])

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from edge.inference import scheduling
 from edge.inference.scheduling import (
     GAP_NS,
-    Background,
     GiveWay,
     Role,
     Schedule,
@@ -23,7 +23,9 @@ from edge.inference.scheduling import (
     enter,
     lock_memory,
     make_schedule,
-    protect_interpreter,
+    prepare_process,
+    raise_priority,
+    reasoning_priority,
     run_as,
     service_priority,
 )
@@ -179,16 +181,18 @@ FIFO = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
 
 
 class TestInterpreter:
-    """Who holds the interpreter's lock must not wait for other programs: the control thread would wait with it."""
+    """Who takes the interpreter's lock must not wait for other programs: the control thread would wait with it."""
 
-    def test_all_python_threads_get_a_priority_below_controls_that_their_processes_do_not_inherit(
+    def test_preparing_gives_all_python_threads_a_priority_that_their_processes_do_not_inherit(
         self, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         policies, ended = Policies(monkeypatch), threading.Event()
+        monkeypatch.setattr(scheduling, "lock_memory", lambda: None)
+        monkeypatch.setattr(scheduling, "freeze_garbage", lambda: None)
         thread = threading.Thread(target=ended.wait)
         thread.start()
         try:
-            protect_interpreter(Role("control", priority=50))
+            assert prepare_process(Role("control", priority=50)) == []
             alive = {one.native_id for one in threading.enumerate()}
         finally:
             ended.set()
@@ -196,45 +200,24 @@ class TestInterpreter:
         assert {native_id for native_id, _, _ in policies.set} == alive and thread.native_id in alive
         assert {(policy, priority) for _, policy, priority in policies.set} == {(FIFO, 40)}
 
-    @pytest.mark.parametrize(("control", "others"), [(None, None), (50, 40), (11, 1), (5, 1)])
-    def test_their_priority_follows_the_control_threads(self, control: int | None, others: int | None) -> None:
-        assert service_priority(Role("control", priority=control)) == others
+    @pytest.mark.parametrize(
+        ("control", "others", "reasoning"), [(None, None, None), (50, 40, 30), (21, 11, 1), (11, 1, 1), (5, 1, 1)]
+    )
+    def test_the_priorities_follow_controls_and_reasonings_is_the_last(
+        self, control: int | None, others: int | None, reasoning: int | None
+    ) -> None:
+        role = Role("control", priority=control)
+        assert (service_priority(role), reasoning_priority(role)) == (others, reasoning)
 
-    def test_without_a_priority_of_the_control_thread_nothing_is_set(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_without_a_priority_nothing_is_set(self, monkeypatch: pytest.MonkeyPatch) -> None:
         policies = Policies(monkeypatch)
-        protect_interpreter(Role("control"))
-        with Background(None):
-            pass
+        raise_priority(0, None)
         assert policies.set == []
 
     def test_a_refusal_is_no_error(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        Policies(monkeypatch, refused=True)
-        protect_interpreter(Role("control", priority=50))
-
-    def test_a_call_of_a_graph_is_ordinary_and_what_comes_between_two_is_not(
-        self, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        policies = Policies(monkeypatch)
-        background = Background(40)
-        for _ in range(2):
-            with background:
-                policies.set.append((0, -1, -1))
-        ordinary, urgent, call = (0, os.SCHED_OTHER, 0), (0, FIFO, 40), (0, -1, -1)
-        assert policies.set == [urgent, *[ordinary, call, urgent] * 2]
-
-    def test_a_call_that_fails_leaves_the_thread_urgent(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        policies = Policies(monkeypatch)
-        with pytest.raises(KeyError), Background(40):
-            raise KeyError
-        assert policies.set[-1] == (0, FIFO, 40)
-
-    def test_where_it_is_refused_a_call_changes_nothing(self, monkeypatch: pytest.MonkeyPatch) -> None:
         policies = Policies(monkeypatch, refused=True)
-        background = Background(40)
-        policies.set.clear()
-        with background:
-            pass
-        assert policies.set == []
+        raise_priority(0, 40)
+        assert policies.set == [(0, FIFO, 40)]
 
 
 def test_memory_is_not_locked_under_a_limit_that_later_allocations_would_break() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -46,6 +47,19 @@ def test_the_recorded_state_is_the_published_one(bench: Bench) -> None:
     assert (record["anchor_ns"], record["frames_ns"], record["new_tokens"]) == (2_000_000_000, [2_000_000_000], 3)
     times = bench.loop.times
     assert {len(each) for each in (times.generation_ms, times.anchor_to_ready_ms, times.late_anchor_ms)} == {1}
+
+
+# The thread
+
+
+def test_the_thread_takes_its_real_time_priority_before_its_first_generation(monkeypatch: pytest.MonkeyPatch) -> None:
+    taken: list[tuple[int, int]] = []
+    monkeypatch.setattr(os, "sched_setscheduler", lambda thread, _, param: taken.append((thread, param.sched_priority)))
+    with Bench(priority=30) as bench:
+        bench.language.during_finish = lambda _run: taken.append((0, 0))
+        bench.frame(2.0)
+        bench.wait_for(lambda: bench.slot.state is not None)
+    assert taken[:2] == [(0, 30), (0, 0)]
 
 
 # Release delay

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -15,6 +16,7 @@ import pytest
 
 from edge.core.deadline import Deadline
 from edge.inference.release import ReleaseDelay
+from edge.inference.scheduling import Role
 from edge.inference.warm_up import WarmUp
 from edge.reasoning.generation_cycle import Mode
 from edge.run import assembly
@@ -42,8 +44,8 @@ class Rig:
     The robot is ready after `ready_s` on a clock that every sleep advances; `at_5_s` is called from then on.
     """
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, ready_s: float = 0.0) -> None:
-        self.now_ns, self.ready_s = 0, ready_s
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, ready_s: float = 0.0, priority: int | None = None) -> None:
+        self.now_ns, self.ready_s, self.priority = 0, ready_s, priority
         self.at_5_s: Callable[[], None] = lambda: None
         self.on_arm: Callable[[], int] = self._arm
         self.control: Callable[[], None] = lambda: None
@@ -59,7 +61,9 @@ class Rig:
                 tested="",
                 guard=SimpleNamespace(stage=lambda *_: nullcontext()),
             ),
-            "schedule_for": lambda _artifacts: SimpleNamespace(notes=(), control=None),
+            "schedule_for": lambda _artifacts: SimpleNamespace(
+                notes=(), control=Role("control", priority=self.priority)
+            ),
             "warm_up": lambda *_: WarmUp(1.0, ()),
             "check_tick": lambda *_: None,
             "ServiceReporter": lambda *_args, **_named: self,
@@ -175,6 +179,27 @@ def test_a_run_that_never_began_leaves_no_log(rig: Rig, tmp_path: Path) -> None:
     with pytest.raises(ArmedError):
         rig.run(record=tmp_path / "flight.mcap")
     assert list(tmp_path.iterdir()) == []
+
+
+# The threads
+
+
+def test_what_reads_the_robot_has_a_priority_that_its_librarys_threads_inherit(monkeypatch: pytest.MonkeyPatch) -> None:
+    taken: list[tuple[int, int, int]] = []
+    rig = Rig(monkeypatch, priority=50)
+    monkeypatch.setattr(
+        os,
+        "sched_setscheduler",
+        lambda thread, policy, param: taken.append((threading.get_native_id(), policy, param.sched_priority)),
+    )
+    opened_in: list[int] = []
+    build = module.RobotInputs
+    monkeypatch.setattr(
+        module, "RobotInputs", lambda *a, **named: (opened_in.append(threading.get_native_id()), build(*a, **named))[1]
+    )
+    with pytest.raises(ArmedError):
+        rig.run()
+    assert taken == [(opened_in[0], os.SCHED_FIFO, 40)]
 
 
 # Waiting for the robot

@@ -142,6 +142,7 @@ class Bench:
         mode: Mode = Mode.ASYNC,
         decoding: Decoding = Decoding.CONSTRAINED,
         late_anchor: bool = True,
+        priority: int | None = None,
         give_way: object = None,
         stop: threading.Event | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
@@ -166,6 +167,7 @@ class Bench:
                 budget=lambda: self.budget,
                 give_way=give_way,  # type: ignore[arg-type]
                 role=Role("reasoning"),
+                priority=priority,
                 late_anchor=late_anchor,
             ),
             outputs=ReasoningOutputs(recorder, self.said.append),  # type: ignore[arg-type]

@@ -34,7 +34,7 @@ from sim_hil.realtime.robots import (
     RunAddress,
     StackRobot,
 )
-from sim_hil.realtime.stack import COMMANDS, READY_LINE
+from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_PRIORITY
 from sim_hil.realtime.truth import LineTail
 from tools.demo import INSTRUCTION
 from tools.faults.rig.circle import SPEED_MPS
@@ -130,7 +130,8 @@ class Rig:
         """Start the robot's side and the sniffer, and wait for both. Raises StepError."""
         scene = [*self.stack_robot.hil_arguments(self.address), "--scene", "corridor", "--people", "0"]
         where = ["--trace", str(self.folder / "trace.jsonl"), "--faults", str(self.folder / "hil.faults")]
-        self.hil = self._children.start("edge-hil", [*COMMANDS["edge-hil"], *scene, *where])
+        command = [*COMMANDS["edge-hil"], *scene, *where]
+        self.hil = self._children.start("edge-hil", command, fifo_priority=ROBOT_PRIORITY)
         waited = [(self.hil, READY_LINE)]
         if self._sniffs:
             sniffer = [sys.executable, "-m", "tools.faults.rig.sniffer", self.stack_robot.protocol, self._bus]
