@@ -1,0 +1,171 @@
+"""Memory of the live view over hours: a flight log is streamed in real time, again and again, to five viewers.
+
+    python -m tools.memory.stream out/demo/flight.mcap --hours 8 --out out/stream
+
+Of the viewers two are pages, one is Foxglove with every channel, one reads nothing and one reads 1 kB/s. No robot and
+no model runs. A reading is written to readings.jsonl every 10 s, so that an end by force loses nothing; SIGINT and
+SIGTERM end the stream and judge what there is. The second half counts: growth of the private memory of the view, and
+of the process that feeds it, of at most 1 MB/h.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import psutil
+
+from edge.core.cli import EXIT_CHECK_FAILED, EXIT_DONE, check_result_directory, command_line, write_result
+from edge.flightlog.part import Payload
+from edge.flightlog.reader import RecordingError, jpeg_bytes, read_messages
+from edge.flightlog.schemas import SCHEMAS
+from edge.live.feed import LiveFeed
+from edge.live.options import LiveError, LiveOptions
+from firmware_bridge.system.terminal import CommandParser
+from sim_hil.realtime.children import Children, StepError
+from tools.bench import bad_input
+from tools.memory.gauge import LIMIT_MIB_PER_H, later_half, read_own, read_sizes
+
+PERIOD_S: Final = 10.0
+"""Time between two readings, s."""
+PICTURES: Final = "/camera"
+_FIVE: Final = "five viewers"
+JUDGED: Final = ("view", "feed")
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Messages of a flight log by their time since its first one, s; `seconds` later it begins again."""
+
+    messages: tuple[tuple[float, str, Payload], ...]
+    seconds: float
+
+
+def read_recording(log: Path) -> Recording:
+    """Read what a run sent to its view. Raises RecordingError, OSError, or ValueError for a log without pictures."""
+    found: list[tuple[int, str, Payload]] = []
+    for topic, stamp_ns, record in read_messages(log):
+        if topic == PICTURES:
+            found.append((stamp_ns, topic, jpeg_bytes(record)))
+        elif topic in SCHEMAS:  # the rest are messages for viewers, which the view makes itself
+            found.append((stamp_ns, topic, record))
+    if not any(topic == PICTURES for _, topic, _ in found):
+        raise ValueError(f"{log}: no picture in it; record a run with a camera")
+    found.sort(key=lambda message: message[0])
+    first_ns, last_ns = found[0][0], found[-1][0]
+    return Recording(tuple(((at - first_ns) / 1e9, *rest) for at, *rest in found), (last_ns - first_ns) / 1e9 + 0.1)
+
+
+class Stream:
+    """Feeds a recording to a view and takes readings; `folder` receives them and the viewers' log."""
+
+    def __init__(self, recording: Recording, folder: Path) -> None:
+        self._recording, self._folder = recording, folder
+        self._end = threading.Event()
+        self.readings: list[dict[str, Any]] = []
+
+    def stop(self, *_: object) -> None:
+        """End the stream soon; safe in a signal handler."""
+        self._end.set()
+
+    def run(self, hours: float) -> None:
+        """Stream for so many hours or until `stop`. Raises LiveError or StepError."""
+        feed = LiveFeed(LiveOptions(port=0), None, lambda: False, print)
+        try:
+            with Children(self._folder) as children, (self._folder / "readings.jsonl").open("w") as file:
+                command = [sys.executable, "-m", "tools.bench.live_viewers", feed.url, _FIVE]
+                viewers = children.start("viewers", command)
+                [view] = [one for one in psutil.Process().children() if "edge.live.server" in one.cmdline()]
+                sending = threading.Thread(target=self._send, args=(feed,), name="stream", daemon=True)
+                sending.start()
+                end_s = time.monotonic() + 3600 * hours
+                while time.monotonic() < end_s and not self._end.wait(PERIOD_S):
+                    if not viewers.running:
+                        raise viewers.failure("the viewers have ended")
+                    own = read_own(objects=False)
+                    one = {"t_ns": own["t_ns"], "feed": own, "view": read_sizes(view.pid), "dropped": feed.dropped}
+                    one["view_cpu_s"] = sum(view.cpu_times()[:2])
+                    self.readings.append(one)
+                    file.write(json.dumps(one) + "\n")
+                    file.flush()
+                self._end.set()
+                sending.join()
+        finally:
+            feed.close()
+
+    def _send(self, feed: LiveFeed) -> None:
+        begin_s = time.monotonic()
+        while not self._end.is_set():
+            for into_s, topic, payload in self._recording.messages:
+                if self._end.wait(max(0.0, begin_s + into_s - time.monotonic())):
+                    return
+                feed.put(topic, time.monotonic_ns(), payload)
+            begin_s += self._recording.seconds
+
+
+def judge(readings: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the growth of each process over the second half, and whether all of it is known and within the limit."""
+    growth: dict[str, Any] = {}
+    for name in JUDGED:
+        series = [{"t_ns": one["t_ns"], **{k: v for k, v in one[name].items() if k != "t_ns"}} for one in readings]
+        found = {column: later_half(series, column) for column in ("private_dirty", "rss")} if series else {}
+        growth[name] = {column: None if one is None else one._asdict() for column, one in found.items()}
+    private = [growth[name].get("private_dirty") for name in JUDGED]
+    hours = (readings[-1]["t_ns"] - readings[0]["t_ns"]) / 3.6e12 if readings else 0.0
+    return {
+        "hours": round(hours, 3),
+        "mib_per_h": growth,
+        "limit_mib_per_h": LIMIT_MIB_PER_H,
+        "dropped": readings[-1]["dropped"] if readings else 0,
+        "ok": all(one is not None and one["per_h"] <= LIMIT_MIB_PER_H for one in private),
+        "tagged": "measured",
+    }
+
+
+@command_line("stream")
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    p = CommandParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("log", type=Path, help="flight log of a run, such as the demo's")
+    p.add_argument("--hours", type=float, default=8.0, metavar="H", help="default: 8")
+    p.add_argument("--out", type=Path, default=Path("out/stream"), metavar="DIR", help="default: out/stream")
+    args = p.parse_args(argv)
+    try:
+        if not 0 < args.hours <= 24 * 7:
+            raise ValueError(f"--hours {args.hours}: expected a number above 0, at most a week")
+        check_result_directory(args.out)
+        recording = read_recording(args.log)
+        args.out.mkdir(parents=True, exist_ok=True)
+    except (RecordingError, OSError, ValueError) as error:
+        return bad_input("stream", error)
+    stream = Stream(recording, args.out)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stream.stop)
+    try:
+        stream.run(args.hours)
+    except (LiveError, StepError, psutil.Error, OSError) as error:
+        sys.stderr.write(f"stream: {error}\n")
+        return EXIT_CHECK_FAILED
+    finally:
+        result = judge(stream.readings)
+        write_result(str(args.out / "stream.json"), result)
+    for name, found in result["mib_per_h"].items():
+        for column, one in found.items():
+            text = (
+                "too few readings" if one is None else f"{one['per_h']:+.2f} ({one['low']:+.2f} to {one['high']:+.2f})"
+            )
+            print(f"{name} {column}: {text} MiB/h")
+    print(f"{result['hours']} h, {result['dropped']} dropped: {'within the limit' if result['ok'] else 'NOT SHOWN'}")
+    return EXIT_DONE if result["ok"] else EXIT_CHECK_FAILED
+
+
+if __name__ == "__main__":
+    sys.exit(main())
