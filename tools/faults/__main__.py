@@ -151,6 +151,9 @@ def attempt(rig: Rig, row: Row, rng: random.Random, host: HostStall) -> Sample:
     """Make one injection, then wait for the row's pause."""
     begun_ns = time.monotonic_ns()
     try:
+        rig.stand_in = row.by_bridge
+        rig.ensure_moving()
+        begun_ns = time.monotonic_ns()  # without the start of a runner: the pause is between two effects
         sample = injection(rig, row, rng, host)
     except (FaultError, StepError) as error:
         # A fault without effect or a runner that does not drive fails only this injection.

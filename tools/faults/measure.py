@@ -46,9 +46,7 @@ class Sample:
 
 
 def injection(rig: Rig, row: Row, rng: random.Random, host: HostStall) -> Sample:
-    """Make one injection. Raises StepError or FaultError if the rig does not work."""
-    rig.stand_in = row.by_bridge
-    rig.ensure_moving()
+    """Make one injection into a robot that moves. Raises StepError or FaultError if the rig does not work."""
     time.sleep(rng.uniform(0.0, PHASE_S))
     before_ns = time.monotonic_ns()
     new = rig.received.sources() - {one.source for one in rig.received.since(before_ns - _RECENT_NS)}
