@@ -32,13 +32,13 @@ from edge.core.cli import (
 from export.checkpoint.load import shipped_weights
 from export.model.config import PRESETS
 from export.model.weights import CheckpointError
-from firmware_bridge.core.config import ConfigError, load_robot_config
+from firmware_bridge.core.config import BRIDGE_PRIORITY, ConfigError, load_robot_config
 from firmware_bridge.system.input_file import read_json
 from firmware_bridge.system.terminal import CommandParser
 from reporting.progress import Progress
 from sim_hil.realtime.children import Child, Children, StepError
 from sim_hil.realtime.robots import BRIDGE_SOCKET, GO2, ROBOTS, RunAddress, StackRobot, StackRobotError, free_domain
-from sim_hil.realtime.stack import COMMANDS, READY_LINE, socket_dir
+from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_PRIORITY, socket_dir
 from sim_hil.realtime.truth import LineTail
 from tools.report.demo_report import RunFiles, write_report
 from tools.report.machine import machine_facts
@@ -223,11 +223,13 @@ def _drive(
     files, socket = options.files, address.folder / BRIDGE_SOCKET
     limit_mps = None if trained(options.artifacts) else UNTRAINED_SPEED_MPS
     common = ["--robot", str(options.robot.write_file(files.robot, address, limit_mps))]
-    hil = children.start("edge-hil", [*commands["edge-hil"], *_hil_arguments(options, address)])
+    command = [*commands["edge-hil"], *_hil_arguments(options, address)]
+    hil = children.start("edge-hil", command, fifo_priority=ROBOT_PRIORITY)
     with _progress(lambda elapsed_s: f"starting the simulated robot, {elapsed_s:.0f} s") as progress:
         children.wait_until(hil, lambda: _says_ready(hil.log), READY_TIMEOUT_S, "ready line", progress.tick)
     bridge_result = ["--json", str(files.result("edge-bridge"))]
-    bridge = children.start("edge-bridge", [*commands["edge-bridge"], *common, *bridge_result])
+    command = [*commands["edge-bridge"], *common, *bridge_result]
+    bridge = children.start("edge-bridge", command, fifo_priority=BRIDGE_PRIORITY)
     with _progress(lambda elapsed_s: f"starting the bridge, {elapsed_s:.0f} s") as progress:
         children.wait_until(bridge, socket.exists, BRIDGE_TIMEOUT_S, f"socket {socket}", progress.tick)
     run = children.start("edge-run", [*commands["edge-run"], *common, *_run_arguments(options)])

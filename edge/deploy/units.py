@@ -205,7 +205,7 @@ def runner_unit(inputs: ServiceInputs) -> str:
         ("Environment", "ORT_DISABLE_TELEMETRY=1"),
         *_ending(watchdog_s=3, start_s=180, stop_s=10),
         *_starting_again(inputs),
-        "The control thread asks for real time by itself; the rest of the process stays ordinary.",
+        "The runner gives its threads real-time priorities by itself; the control thread has the highest.",
         ("LimitRTPRIO", str(inputs.control_priority)),
         ("LimitMEMLOCK", "infinity"),
         "Dies first, and never makes the bridge wait for memory.",

@@ -98,7 +98,7 @@ class LanguageModel:
         `interrupt` ends every call that is given none of its own.
         """
         runtime = artifacts.runtime
-        role = schedule.reasoning if schedule else None
+        role = schedule.workers if schedule else None
         cores = role.cores if role else ()
         graphs = run_as(
             role,

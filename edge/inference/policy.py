@@ -39,7 +39,7 @@ class Policy:
 
         `interrupt` ends every call that is given none of its own.
         """
-        control, reasoning = (schedule.control, schedule.reasoning) if schedule else (None, None)
+        control, workers = (schedule.control, schedule.workers) if schedule else (None, None)
 
         def graph(name: str, cores: Sequence[int]) -> Graph:
             return Graph(artifacts, name, threads=threads, provider=provider, cores=cores, interrupt=interrupt)
@@ -50,7 +50,7 @@ class Policy:
         )
         self.guided_by_waypoints = artifacts.guided_by_waypoints
         """Whether the semantic context is computed in every tick from the text's waypoints instead of K‖V."""
-        role = control if self.guided_by_waypoints else reasoning
+        role = control if self.guided_by_waypoints else workers
         self._context = run_as(role, lambda: graph("semantic_context", role.cores if role else ()))
         self.artifacts = artifacts
         self._activity = activity or TickActivity(artifacts.runtime.tick_period_ms * 1_000_000)

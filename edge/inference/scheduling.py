@@ -11,7 +11,7 @@ import resource
 import threading
 import time
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 from edge.artifacts.manifest import Artifacts
@@ -28,7 +28,7 @@ SPARE_CORES = 1
 """Cores left to camera, odometry and recorder before reasoning's threads are pinned; with fewer, the operating system
 distributes the cores better."""
 PRIORITY_STEPS = 10
-"""Distance in real-time priority from the control thread to the other Python threads, and from them to reasoning."""
+"""Distance in real-time priority from the control thread to the inputs' threads, and from them to reasoning."""
 ROUND_NS = 1_000_000
 """Period at which a waiting reasoning thread checks again, ns."""
 GAP_NS = 2_000_000
@@ -59,10 +59,19 @@ class Role:
 
 @dataclass(frozen=True)
 class Schedule:
-    """Both threads' roles, and whether they compete for what computes."""
+    """The threads' roles, and whether control and reasoning compete for what computes.
+
+    Every thread that takes the interpreter's lock needs a real-time priority: an ordinary thread that the kernel has
+    set aside keeps the lock, or its turn to take it, and the control thread waits. Beside two busy programs on 2
+    cores ordinary threads waited up to 0.6 s, whatever their niceness.
+    """
 
     control: Role
+    inputs: Role
+    """Threads that read the robot, record or print."""
     reasoning: Role
+    workers: Role
+    """Further threads of the language model's graphs; above reasoning, which spins until they have ended."""
     shared: bool
     """Whether reasoning can occupy a tick's core or accelerator, so that it has to wait for ticks."""
     notes: tuple[str, ...] = ()
@@ -70,14 +79,19 @@ class Schedule:
 
 
 def schedule_for(artifacts: Artifacts, allowed: Collection[int] | None = None) -> Schedule:
-    """Return the schedule of a target's artifacts on this process's cores."""
+    """Return the schedule of a target's artifacts on this process's cores.
+
+    Without permission for control's real-time priority no thread gets one: the order of the others would be wrong.
+    """
     runtime = artifacts.runtime
     reasoning_graphs = (*artifacts.language_graphs, "semantic_context")
     sessions = {name: graph.session for name, graph in artifacts.graphs.items()}
-    return make_schedule(
+    priority = runtime.control_priority or None
+    refusal = None if priority is None else priority_refusal(priority)
+    schedule = make_schedule(
         control_cores=runtime.control_cores,
         reasoning_cores=runtime.reasoning_cores,
-        control_priority=runtime.control_priority or None,
+        control_priority=priority if refusal is None else None,
         allowed=os.sched_getaffinity(0) if allowed is None else allowed,
         control_threads=max(sessions[name].threads or 1 for name in CONTROL_GRAPHS),
         reasoning_threads=max(sessions[name].threads or 1 for name in reasoning_graphs),
@@ -85,6 +99,7 @@ def schedule_for(artifacts: Artifacts, allowed: Collection[int] | None = None) -
             [sessions[name].provider for name in CONTROL_GRAPHS], [sessions[name].provider for name in reasoning_graphs]
         ),
     )
+    return schedule if refusal is None else replace(schedule, notes=(*schedule.notes, refusal))
 
 
 def make_schedule(
@@ -99,7 +114,8 @@ def make_schedule(
 ) -> Schedule:
     """Return the roles from the target's settings and the available cores; pure.
 
-    Without cores in the target, reasoning avoids the control thread's cores if enough others are available.
+    Without cores in the target, reasoning avoids the control thread's cores if enough others are available. A thread
+    for whose real-time priority there is no number above 0 has an ordinary one.
     """
     available = set(allowed)
     notes = [
@@ -114,9 +130,16 @@ def make_schedule(
     if not reasoning and len(available) >= control_threads + reasoning_threads + SPARE_CORES:
         reasoning = set(sorted(available)[:-control_threads])
     free = (control or available) - (reasoning or available)
+    cores = tuple(sorted(reasoning))
+    inputs_priority, lowest = (
+        None if control_priority is None or control_priority <= below else control_priority - below
+        for below in (PRIORITY_STEPS, 2 * PRIORITY_STEPS)
+    )
     return Schedule(
         control=Role("control", tuple(sorted(control)), control_priority, CONTROL_NICENESS),
-        reasoning=Role("reasoning", tuple(sorted(reasoning)), None, REASONING_NICENESS),
+        inputs=Role("inputs", priority=inputs_priority),
+        reasoning=Role("reasoning", cores, lowest, REASONING_NICENESS),
+        workers=Role("reasoning's graphs", cores, None if lowest is None else lowest + 1, REASONING_NICENESS),
         shared=one_device or len(free) < control_threads,
         notes=tuple(notes),
     )
@@ -165,46 +188,32 @@ def enter(role: Role, calls: ThreadCalls | None = None) -> list[str]:
     return lines
 
 
-def service_priority(control: Role) -> int | None:
-    """Return the priority of SCHED_FIFO for Python threads beside the control thread; None: it has none itself."""
-    return None if control.priority is None else max(1, control.priority - PRIORITY_STEPS)
+def priority_refusal(priority: int) -> str | None:
+    """Request a real-time priority in a short-lived thread; return a line for the operator where it is refused."""
+    lines: list[str] = []
+    run_in_thread("priority", lambda: lines.extend(enter(Role("control", priority=priority))))
+    return lines[0] if lines else None
 
 
-def reasoning_priority(control: Role) -> int | None:
-    """Return the priority of SCHED_FIFO for the reasoning thread, the last of all; None: the control thread has none.
+def prepare_process(inputs: Role) -> list[str]:
+    """Prepare for driving, once everything that lives as long as the process exists; return lines for the operator.
 
-    Its graphs' own threads keep ordinary scheduling.
+    It gives all Python threads that live now the inputs' real-time priority.
     """
-    return None if control.priority is None else max(1, control.priority - 2 * PRIORITY_STEPS)
-
-
-def raise_priority(thread: int, priority: int | None) -> None:
-    """Give a thread (0: the caller) this priority of SCHED_FIFO; without permission or priority nothing changes.
-
-    Every thread that takes the interpreter's lock needs one: an ordinary thread that the kernel has set aside keeps
-    the lock, or its turn to take it, and the control thread waits. Beside two busy programs on 2 cores ordinary
-    threads waited up to 0.6 s, whatever their niceness.
-    """
-    if priority is not None:
-        with contextlib.suppress(OSError):
-            os.sched_setscheduler(thread, _FIFO, os.sched_param(priority))
-
-
-def prepare_process(control: Role) -> list[str]:
-    """Prepare for driving, once everything that lives as long as the process exists; return lines for the operator."""
     refused = lock_memory()
     freeze_garbage()
     for thread in threading.enumerate():
-        if thread.native_id is not None:
-            raise_priority(thread.native_id, service_priority(control))
+        if inputs.priority is not None and thread.native_id is not None:
+            with contextlib.suppress(OSError):
+                os.sched_setscheduler(thread.native_id, _FIFO, os.sched_param(inputs.priority))
     return [] if refused is None else [refused]
 
 
 def run_as(role: Role | None, body: Callable[[], Result]) -> Result:
     """Run `body` in a thread of that role and wait for it: its child threads inherit cores and priority.
 
-    ONNX Runtime's workers are such threads: without this, the language model's would have the control thread's
-    priority. Raises what `body` raises.
+    The threads of libraries are such threads: ONNX Runtime's workers, and those that receive for DDS. Raises what
+    `body` raises.
     """
     if role is None:
         return body()
@@ -214,7 +223,7 @@ def run_as(role: Role | None, body: Callable[[], Result]) -> Result:
         enter(role)
         results.append(body())
 
-    run_in_thread(f"open-{role.name}", target)
+    run_in_thread(f"open {role.name}", target)
     return results[0]
 
 

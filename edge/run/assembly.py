@@ -15,7 +15,7 @@ from edge.inference.generation_task import GenerationModels
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
 from edge.inference.release import ReleaseDelay
-from edge.inference.scheduling import GiveWay, Schedule, TickActivity, reasoning_priority
+from edge.inference.scheduling import GiveWay, Schedule, TickActivity
 from edge.live.options import LiveOptions
 from edge.motion.controller import Controller, ControllerConfig
 from edge.power.governor.plan import read_power_plan
@@ -136,7 +136,6 @@ def assemble(
             budget=power.budget,
             give_way=GiveWay(engines.activity) if engines.schedule.shared else None,
             role=engines.schedule.reasoning,
-            priority=reasoning_priority(engines.schedule.control),
         ),
         outputs=ReasoningOutputs(recorder, say),
     )

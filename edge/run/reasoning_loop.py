@@ -16,7 +16,7 @@ from edge.core.stats import Samples
 from edge.flightlog.recorder import RecordSink
 from edge.inference.generation_task import GENERATION_ERRORS, GenerationModels, GenerationResult, GenerationTask
 from edge.inference.graph import CancelledError, Interrupt
-from edge.inference.scheduling import REASONING_NICENESS, GiveWay, Role, enter, raise_priority
+from edge.inference.scheduling import REASONING_NICENESS, GiveWay, Role, enter
 from edge.reasoning.anchor import Anchor, older_frames
 from edge.reasoning.generation_cycle import (
     UNLIMITED,
@@ -64,8 +64,6 @@ class ReasoningSchedule:
     give_way: GiveWay | None = None
     """Set where reasoning competes with control ticks for a core or the accelerator."""
     role: Role = REASONING_ROLE
-    priority: int | None = None
-    """Real-time priority of the thread; None, or without permission: the role's niceness."""
     late_anchor: bool = True
     """Capture the newest frame after the older ones were prefilled. Sync mode ignores this: the robot stands."""
 
@@ -196,7 +194,6 @@ class ReasoningLoop:
         """Run generations until `stop`; count failures and try again."""
         for line in enter(self._schedule.role):
             self._outputs.say(line)
-        raise_priority(0, self._schedule.priority)
         while not self._stop.is_set():
             if not self.step():
                 self._stop.wait(IDLE_S)

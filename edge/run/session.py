@@ -19,7 +19,7 @@ from edge.flightlog.recorder import Recorder, space_refusal
 from edge.flightlog.records import RecordSinks
 from edge.inference.graph import GraphError
 from edge.inference.language import ContextOverflowError
-from edge.inference.scheduling import Role, TickActivity, enter, prepare_process, run_as, schedule_for, service_priority
+from edge.inference.scheduling import TickActivity, enter, prepare_process, run_as, schedule_for
 from edge.inference.start_guard import WARM_UP_S
 from edge.inference.warm_up import check_tick, open_proven, warm_up
 from edge.reasoning.generation_cycle import Mode
@@ -150,7 +150,7 @@ class RunSession:
             sink = CommandTap(bridge)
             # The threads of a protocol's library inherit the priority, so that poses and pictures do not wait either.
             inputs = run_as(
-                Role("inputs", priority=service_priority(self._schedule.control)),
+                self._schedule.inputs,
                 lambda: RobotInputs(
                     self._robot,
                     image_px=self._artifacts.runtime.image_px,
@@ -185,7 +185,7 @@ class RunSession:
             say, live = self._lines.append, views.live
             channel = open_channels(self._options, self._robot, self._bus, check, by_phrase, say, live)
             loops.power.start()
-            self._lines.extend(prepare_process(self._schedule.control))
+            self._lines.extend(prepare_process(self._schedule.inputs))
             loops.control.last_seq = self._arm(bridge, loops, channel)
             self._print(f"armed and driving {self._robot.name}: {self._options.instruction}")
             started_ns = time.monotonic_ns()

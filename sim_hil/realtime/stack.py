@@ -32,10 +32,9 @@ COMMANDS: Mapping[str, Sequence[str]] = {
     "edge-run": (sys.executable, "-m", "edge.run.command"),
 }
 
-ROBOT_PRIORITY = 20
-"""Real-time priority of the robot's side where permitted, above ordinary programs and below the runner's threads.
-
-A robot has a computer of its own: what else runs on this one must not slow it.
+ROBOT_PRIORITY = 35
+"""Real-time priority of the robot's side where permitted: a robot has a computer of its own, so neither ordinary
+programs nor reasoning, which computes for long, may slow it. Ticks and the bridge come first.
 """
 READY_TIMEOUT_S = 120.0
 BRIDGE_TIMEOUT_S = 30.0

@@ -309,13 +309,24 @@ def test_bad_arguments_are_refused_in_one_line(
 
 
 class Hindered:
-    """A rig whose robot does not drive on, the first `times`."""
+    """A rig whose robot does not drive on, the first `times`; its runner takes `start_s` to start."""
 
-    def __init__(self, times: int, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.left = times
+    stand_in = False
+
+    def __init__(self, times: int, monkeypatch: pytest.MonkeyPatch, start_s: float = 0.0) -> None:
+        self.left, self.start_s, self.now_s, self.injected_s = times, start_s, 0.0, list[float]()
         monkeypatch.setattr(command, "injection", self.injection)
+        clock = SimpleNamespace(monotonic_ns=lambda: round(self.now_s * 1e9), sleep=self.sleep)
+        monkeypatch.setattr(command, "time", clock)
+
+    def sleep(self, seconds: float) -> None:
+        self.now_s += seconds
+
+    def ensure_moving(self) -> None:
+        self.now_s, self.start_s = self.now_s + self.start_s, 0.0
 
     def injection(self, *_: object) -> Sample:
+        self.injected_s.append(self.now_s)
         self.left -= 1
         return Sample(100.0, 0.0, hindered=["did not drive on"] if self.left >= 0 else [])
 
@@ -328,6 +339,14 @@ def test_a_robot_that_does_not_drive_on_fails_a_row_only_twice_in_a_row(
     result = command.run_row(rig, row(), 1, random.Random(0), None)  # type: ignore[arg-type]
     assert result.repeated == repeated and (not result.problems) == passes
     assert len(result.samples) == 1 + repeated
+
+
+def test_the_pause_of_a_row_is_between_two_injections_however_long_the_runner_takes_to_start(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rig = Hindered(0, monkeypatch, start_s=6.0)
+    command.run_row(rig, replace(row(), spacing_s=12.5), 2, random.Random(0), None)  # type: ignore[arg-type]
+    assert rig.injected_s == [6.0, 18.5]
 
 
 class FakeBridge:

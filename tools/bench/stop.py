@@ -19,9 +19,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from edge.core.cli import EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, command_line, write_result
+from firmware_bridge.core.config import BRIDGE_PRIORITY
 from sim_hil.realtime.children import Child, Children, StepError
 from sim_hil.realtime.robots import GO2, ROBOTS, RunAddress, StackRobot
-from sim_hil.realtime.stack import COMMANDS, READY_LINE, socket_dir
+from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_PRIORITY, socket_dir
 from tools.bench import bad_input, command_parser
 from tools.demo import INSTRUCTION
 
@@ -60,9 +61,9 @@ def start_robot(children: Children, folder: Path, robot: StackRobot, options: Se
     address = RunAddress.free(folder)
     link = ["--robot", str(robot.write_file(folder / "robot.toml", address))]
     scene = [*robot.hil_arguments(address), "--scene", "corridor", "--people", "0"]
-    hil = children.start("edge-hil", [*COMMANDS["edge-hil"], *scene, *options])
+    hil = children.start("edge-hil", [*COMMANDS["edge-hil"], *scene, *options], fifo_priority=ROBOT_PRIORITY)
     children.wait_until(hil, lambda: READY_LINE in hil.log.read_text(), 90.0, "ready line", lambda: None)
-    children.start("edge-bridge", [*COMMANDS["edge-bridge"], *link])
+    children.start("edge-bridge", [*COMMANDS["edge-bridge"], *link], fifo_priority=BRIDGE_PRIORITY)
     return link
 
 

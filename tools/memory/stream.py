@@ -4,7 +4,7 @@
 
 Of the viewers two are pages, one is Foxglove with every channel, one reads nothing and one reads 1 kB/s. No robot and
 no model runs. A reading is written to readings.jsonl every 10 s, so that an end by force loses nothing; SIGINT and
-SIGTERM end the stream and judge what there is. The second half counts: growth of the private memory of the view, and
+SIGTERM end the stream and print what there is. The second half counts: growth of the private memory of the view, and
 of the process that feeds it, of at most 1 MB/h.
 """
 
@@ -32,12 +32,14 @@ from edge.live.options import LiveError, LiveOptions
 from firmware_bridge.system.terminal import CommandParser
 from sim_hil.realtime.children import Children, StepError
 from tools.bench import bad_input
-from tools.memory.gauge import LIMIT_MIB_PER_H, later_half, read_own, read_sizes
+from tools.memory.gauge import LIMIT_MIB_PER_H, later_half, read_sizes
 
 PERIOD_S: Final = 10.0
 """Time between two readings, s."""
 PICTURES: Final = "/camera"
 _FIVE: Final = "five viewers"
+_VIEW: Final = "edge.live.server"
+_SIZES: Final = ("private_dirty", "rss")
 JUDGED: Final = ("view", "feed")
 
 
@@ -61,7 +63,8 @@ def read_recording(log: Path) -> Recording:
         raise ValueError(f"{log}: no picture in it; record a run with a camera")
     found.sort(key=lambda message: message[0])
     first_ns, last_ns = found[0][0], found[-1][0]
-    return Recording(tuple(((at - first_ns) / 1e9, *rest) for at, *rest in found), (last_ns - first_ns) / 1e9 + 0.1)
+    messages = tuple(((at_ns - first_ns) / 1e9, topic, payload) for at_ns, topic, payload in found)
+    return Recording(messages, (last_ns - first_ns) / 1e9 + 0.1)
 
 
 class Stream:
@@ -70,7 +73,7 @@ class Stream:
     def __init__(self, recording: Recording, folder: Path) -> None:
         self._recording, self._folder = recording, folder
         self._end = threading.Event()
-        self.readings: list[dict[str, Any]] = []
+        self.file = folder / "readings.jsonl"
 
     def stop(self, *_: object) -> None:
         """End the stream soon; safe in a signal handler."""
@@ -80,21 +83,22 @@ class Stream:
         """Stream for so many hours or until `stop`. Raises LiveError or StepError."""
         feed = LiveFeed(LiveOptions(port=0), None, lambda: False, print)
         try:
-            with Children(self._folder) as children, (self._folder / "readings.jsonl").open("w") as file:
+            with Children(self._folder) as children, self.file.open("w", encoding="ascii") as file:
                 command = [sys.executable, "-m", "tools.bench.live_viewers", feed.url, _FIVE]
                 viewers = children.start("viewers", command)
-                [view] = [one for one in psutil.Process().children() if "edge.live.server" in one.cmdline()]
+                view = next((one for one in psutil.Process().children() if _VIEW in one.cmdline()), None)
+                if view is None:
+                    raise LiveError("the live view has ended")
                 sending = threading.Thread(target=self._send, args=(feed,), name="stream", daemon=True)
                 sending.start()
                 end_s = time.monotonic() + 3600 * hours
                 while time.monotonic() < end_s and not self._end.wait(PERIOD_S):
                     if not viewers.running:
                         raise viewers.failure("the viewers have ended")
-                    own = read_own(objects=False)
-                    one = {"t_ns": own["t_ns"], "feed": own, "view": read_sizes(view.pid), "dropped": feed.dropped}
-                    one["view_cpu_s"] = sum(view.cpu_times()[:2])
-                    self.readings.append(one)
-                    file.write(json.dumps(one) + "\n")
+                    sizes = {"feed": read_sizes(), "view": read_sizes(view.pid)}
+                    one = {"t_ns": time.monotonic_ns(), **sizes, "dropped": feed.dropped}
+                    # Not kept: the feed's memory is judged too.
+                    file.write(json.dumps({**one, "view_cpu_s": sum(view.cpu_times()[:2])}) + "\n")
                     file.flush()
                 self._end.set()
                 sending.join()
@@ -111,21 +115,25 @@ class Stream:
             begin_s += self._recording.seconds
 
 
-def judge(readings: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the growth of each process over the second half, and whether all of it is known and within the limit."""
+def judge(readings: Sequence[dict[str, Any]], hours: float) -> dict[str, Any]:
+    """Return the growth of each process over the second half, and whether all of it is known and within the limit.
+
+    A stream that ended before `hours` shows nothing.
+    """
     growth: dict[str, Any] = {}
     for name in JUDGED:
-        series = [{"t_ns": one["t_ns"], **{k: v for k, v in one[name].items() if k != "t_ns"}} for one in readings]
-        found = {column: later_half(series, column) for column in ("private_dirty", "rss")} if series else {}
+        series = [{"t_ns": one["t_ns"], **one[name]} for one in readings]
+        found = {column: later_half(series, column) if series else None for column in _SIZES}
         growth[name] = {column: None if one is None else one._asdict() for column, one in found.items()}
-    private = [growth[name].get("private_dirty") for name in JUDGED]
-    hours = (readings[-1]["t_ns"] - readings[0]["t_ns"]) / 3.6e12 if readings else 0.0
+    private = [growth[name]["private_dirty"] for name in JUDGED]
+    took_h = (readings[-1]["t_ns"] - readings[0]["t_ns"]) / 3.6e12 if readings else 0.0
+    whole = took_h * 3600 >= hours * 3600 - 3 * PERIOD_S
     return {
-        "hours": round(hours, 3),
+        "hours": round(took_h, 3),
         "mib_per_h": growth,
         "limit_mib_per_h": LIMIT_MIB_PER_H,
         "dropped": readings[-1]["dropped"] if readings else 0,
-        "ok": all(one is not None and one["per_h"] <= LIMIT_MIB_PER_H for one in private),
+        "ok": whole and all(one is not None and one["per_h"] <= LIMIT_MIB_PER_H for one in private),
         "tagged": "measured",
     }
 
@@ -149,21 +157,24 @@ def main(argv: list[str] | None = None) -> int:
     stream = Stream(recording, args.out)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stream.stop)
+    failure = None
     try:
         stream.run(args.hours)
     except (LiveError, StepError, psutil.Error, OSError) as error:
-        sys.stderr.write(f"stream: {error}\n")
-        return EXIT_CHECK_FAILED
-    finally:
-        result = judge(stream.readings)
-        write_result(str(args.out / "stream.json"), result)
+        failure = str(error)
+        sys.stderr.write(f"stream: {failure}\n")
+    lines = stream.file.read_text("ascii").splitlines() if stream.file.exists() else []
+    result = judge([json.loads(line) for line in lines], args.hours)
+    result |= {"failure": failure, "ok": result["ok"] and failure is None}
+    write_result(str(args.out / "stream.json"), result)
     for name, found in result["mib_per_h"].items():
         for column, one in found.items():
-            text = (
-                "too few readings" if one is None else f"{one['per_h']:+.2f} ({one['low']:+.2f} to {one['high']:+.2f})"
-            )
-            print(f"{name} {column}: {text} MiB/h")
-    print(f"{result['hours']} h, {result['dropped']} dropped: {'within the limit' if result['ok'] else 'NOT SHOWN'}")
+            if one is None:
+                print(f"{name} {column}: too few readings")
+            else:
+                print(f"{name} {column}: {one['per_h']:+.2f} ({one['low']:+.2f} to {one['high']:+.2f}) MiB/h")
+    verdict = "within the limit" if result["ok"] else "NOT SHOWN"
+    print(f"{result['hours']} of {args.hours} h, {result['dropped']} dropped: {verdict}")
     return EXIT_DONE if result["ok"] else EXIT_CHECK_FAILED
 
 

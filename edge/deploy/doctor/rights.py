@@ -6,7 +6,6 @@ import os
 import pwd
 import resource
 import stat
-import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from edge.artifacts.providers import device_nodes
 from edge.deploy.doctor.check import Check, Level, skipped
 from edge.deploy.unit_text import RUNNER_USER
 from edge.deploy.units import NEED_DEVICES
-from edge.inference.scheduling import Role, enter
+from edge.inference.scheduling import priority_refusal
 from edge.power.governor.limits import LimitsConfig
 from edge.power.meters.meter import MeterError, PowerMeter, PowerSample
 from edge.power.meters.rapl import ZONES
@@ -88,16 +87,7 @@ def user_named(name: str | None) -> UserRights:
     return UserRights(name, entry.pw_uid, frozenset(os.getgrouplist(name, entry.pw_gid)), other=True)
 
 
-def try_priority(priority: int) -> list[str]:
-    """Request real-time priority in a short-lived thread; return lines about refused settings."""
-    lines: list[str] = []
-    thread = threading.Thread(target=lambda: lines.extend(enter(Role("control", (), priority))))
-    thread.start()
-    thread.join()
-    return lines
-
-
-def real_time(priority: int, user: UserRights, attempt: Callable[[int], list[str]] = try_priority) -> Check:
+def real_time(priority: int, user: UserRights, attempt: Callable[[int], str | None] = priority_refusal) -> Check:
     """Check whether the control thread can have the target's real-time priority."""
     name = "real-time priority"
     if priority == 0:

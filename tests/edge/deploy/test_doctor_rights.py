@@ -34,9 +34,9 @@ ME = UserRights("somebody", 1000, frozenset({1000}), other=False)
 
 
 def test_real_time_that_is_refused_is_a_warning() -> None:
-    assert real_time(50, ME, lambda _priority: []).level is Level.OK
-    assert real_time(50, ME, lambda _priority: ["refused"]).level is Level.WARN
-    assert real_time(0, ME, lambda _priority: ["refused"]).level is Level.SKIP
+    assert real_time(50, ME, lambda _priority: None).level is Level.OK
+    assert real_time(50, ME, lambda _priority: "refused").level is Level.WARN
+    assert real_time(0, ME, lambda _priority: "refused").level is Level.SKIP
 
 
 def test_memory_may_be_locked_without_a_limit_or_by_root() -> None:
@@ -90,7 +90,7 @@ def test_another_users_right_to_a_file_is_that_of_its_class(tmp_path: Path) -> N
 
 def test_a_check_that_needs_another_users_rights_is_skipped_and_names_the_user() -> None:
     service = replace(ME, name="service", other=True)
-    for check in (real_time(50, service, lambda _priority: []), locked_memory(65536, service)):
+    for check in (real_time(50, service, lambda _priority: None), locked_memory(65536, service)):
         assert (check.level, "service" in check.found) == (Level.SKIP, True)
 
 

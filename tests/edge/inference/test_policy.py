@@ -14,6 +14,7 @@ import pytest
 
 from edge.artifacts.manifest import Artifacts
 from edge.core.geometry import SE2
+from edge.inference import scheduling
 from edge.inference.graph import CancelledError, Graph, GraphError, Interrupt
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
@@ -173,18 +174,22 @@ def test_a_graphs_own_workers_run_on_the_roles_cores(artifacts: Artifacts) -> No
     assert [os.sched_getaffinity(worker) for worker in workers] == [{core}]
 
 
-def test_artifacts_with_cores_of_their_own_make_a_schedule(artifacts: Artifacts) -> None:
+def test_artifacts_with_cores_of_their_own_make_a_schedule(
+    artifacts: Artifacts, monkeypatch: pytest.MonkeyPatch
+) -> None:
     runtime = dataclasses.replace(artifacts.runtime, control_cores=(7,), reasoning_cores=(5, 6), control_priority=40)
+    monkeypatch.setattr(scheduling, "priority_refusal", lambda _priority: None)
     made = schedule_for(dataclasses.replace(artifacts, runtime=runtime), allowed=range(8))
     assert (made.control.cores, made.control.priority) == ((7,), 40)
-    assert (made.reasoning.cores, made.reasoning.priority, made.shared) == ((5, 6), None, False)
+    assert (made.reasoning.cores, made.reasoning.priority, made.shared) == ((5, 6), 20, False)
     assert schedule_for(artifacts, allowed={0}).shared
 
 
-def test_the_language_models_workers_are_as_patient_as_reasoning_is(artifacts: Artifacts) -> None:
+def test_the_language_models_workers_have_a_role_of_their_own(artifacts: Artifacts) -> None:
     """Else they would be as urgent as the control thread, whatever the thread that calls them is."""
     core = min(os.sched_getaffinity(0))
-    schedule = Schedule(Role("control"), Role("reasoning", cores=(core,), niceness=17), shared=False)
+    workers_role = Role("workers", cores=(core,), niceness=17)
+    schedule = Schedule(Role("control"), Role("inputs"), Role("reasoning"), workers_role, shared=False)
     tasks = Path("/proc/self/task")
     before = {path.name for path in tasks.iterdir()}
     language = LanguageModel(artifacts, threads=2, schedule=schedule)

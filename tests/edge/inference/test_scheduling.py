@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from edge.artifacts.manifest import Artifacts
 from edge.inference import scheduling
 from edge.inference.scheduling import (
     GAP_NS,
@@ -24,10 +25,8 @@ from edge.inference.scheduling import (
     lock_memory,
     make_schedule,
     prepare_process,
-    raise_priority,
-    reasoning_priority,
     run_as,
-    service_priority,
+    schedule_for,
 )
 
 MS = 1_000_000
@@ -41,11 +40,12 @@ def schedule(
     reasoning: tuple[int, ...] = (),
     threads: tuple[int, int] = (1, 1),
     one_device: bool = False,
+    priority: int | None = 50,
 ) -> Schedule:
     return make_schedule(
         control_cores=control,
         reasoning_cores=reasoning,
-        control_priority=50,
+        control_priority=priority,
         allowed=allowed,
         control_threads=threads[0],
         reasoning_threads=threads[1],
@@ -183,16 +183,45 @@ FIFO = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
 class TestInterpreter:
     """Who takes the interpreter's lock must not wait for other programs: the control thread would wait with it."""
 
+    @pytest.mark.parametrize(
+        ("control", "others"),
+        [
+            (None, [None, None, None]),
+            (50, [40, 31, 30]),
+            (21, [11, 2, 1]),
+            (20, [10, None, None]),
+            (11, [1, None, None]),
+            (10, [None, None, None]),
+        ],
+    )
+    def test_reasoning_is_below_all_and_its_graphs_threads_above_it(
+        self, control: int | None, others: list[int | None]
+    ) -> None:
+        made = schedule(range(4), priority=control)
+        assert made.control.priority == control
+        assert [role.priority for role in (made.inputs, made.workers, made.reasoning)] == others
+
+    def test_where_controls_priority_is_refused_no_thread_has_one_and_a_line_says_so(
+        self, artifacts: Artifacts, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        Policies(monkeypatch, refused=True)
+        made = schedule_for(artifacts)
+        assert [role.priority for role in (made.control, made.inputs, made.workers, made.reasoning)] == [None] * 4
+        assert "LimitRTPRIO=50" in made.notes[-1]
+
+    def test_where_it_is_permitted_nothing_is_said(self, artifacts: Artifacts, monkeypatch: pytest.MonkeyPatch) -> None:
+        policies = Policies(monkeypatch)
+        assert schedule_for(artifacts).control.priority == 50 and not schedule_for(artifacts).notes
+        assert {(policy, priority) for _, policy, priority in policies.set} == {(os.SCHED_FIFO, 50)}
+
     def test_preparing_gives_all_python_threads_a_priority_that_their_processes_do_not_inherit(
         self, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        policies, ended = Policies(monkeypatch), threading.Event()
-        monkeypatch.setattr(scheduling, "lock_memory", lambda: None)
-        monkeypatch.setattr(scheduling, "freeze_garbage", lambda: None)
+        policies, ended = prepared(monkeypatch), threading.Event()
         thread = threading.Thread(target=ended.wait)
         thread.start()
         try:
-            assert prepare_process(Role("control", priority=50)) == []
+            assert prepare_process(Role("inputs", priority=40)) == []
             alive = {one.native_id for one in threading.enumerate()}
         finally:
             ended.set()
@@ -200,24 +229,20 @@ class TestInterpreter:
         assert {native_id for native_id, _, _ in policies.set} == alive and thread.native_id in alive
         assert {(policy, priority) for _, policy, priority in policies.set} == {(FIFO, 40)}
 
-    @pytest.mark.parametrize(
-        ("control", "others", "reasoning"), [(None, None, None), (50, 40, 30), (21, 11, 1), (11, 1, 1), (5, 1, 1)]
-    )
-    def test_the_priorities_follow_controls_and_reasonings_is_the_last(
-        self, control: int | None, others: int | None, reasoning: int | None
-    ) -> None:
-        role = Role("control", priority=control)
-        assert (service_priority(role), reasoning_priority(role)) == (others, reasoning)
+    def test_preparing_without_a_priority_changes_none(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        policies = prepared(monkeypatch)
+        assert prepare_process(Role("inputs")) == [] and policies.set == []
 
-    def test_without_a_priority_nothing_is_set(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        policies = Policies(monkeypatch)
-        raise_priority(0, None)
-        assert policies.set == []
+    def test_a_refusal_while_preparing_is_no_error(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        policies = prepared(monkeypatch, refused=True)
+        assert prepare_process(Role("inputs", priority=40)) == [] and policies.set
 
-    def test_a_refusal_is_no_error(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        policies = Policies(monkeypatch, refused=True)
-        raise_priority(0, 40)
-        assert policies.set == [(0, FIFO, 40)]
+
+def prepared(monkeypatch: pytest.MonkeyPatch, *, refused: bool = False) -> Policies:
+    """Leave out what preparing does beside priorities, and record those."""
+    monkeypatch.setattr(scheduling, "lock_memory", lambda: None)
+    monkeypatch.setattr(scheduling, "freeze_garbage", lambda: None)
+    return Policies(monkeypatch, refused=refused)
 
 
 def test_memory_is_not_locked_under_a_limit_that_later_allocations_would_break() -> None:

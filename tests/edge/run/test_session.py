@@ -62,7 +62,7 @@ class Rig:
                 guard=SimpleNamespace(stage=lambda *_: nullcontext()),
             ),
             "schedule_for": lambda _artifacts: SimpleNamespace(
-                notes=(), control=Role("control", priority=self.priority)
+                notes=(), inputs=Role("inputs", priority=self.priority), control=None
             ),
             "warm_up": lambda *_: WarmUp(1.0, ()),
             "check_tick": lambda *_: None,
@@ -186,7 +186,7 @@ def test_a_run_that_never_began_leaves_no_log(rig: Rig, tmp_path: Path) -> None:
 
 def test_what_reads_the_robot_has_a_priority_that_its_librarys_threads_inherit(monkeypatch: pytest.MonkeyPatch) -> None:
     taken: list[tuple[int, int, int]] = []
-    rig = Rig(monkeypatch, priority=50)
+    rig = Rig(monkeypatch, priority=40)
     monkeypatch.setattr(
         os,
         "sched_setscheduler",

@@ -166,8 +166,7 @@ class Bench:
                 release_delay_s=lambda: delay_s,
                 budget=lambda: self.budget,
                 give_way=give_way,  # type: ignore[arg-type]
-                role=Role("reasoning"),
-                priority=priority,
+                role=Role("reasoning", priority=priority),
                 late_anchor=late_anchor,
             ),
             outputs=ReasoningOutputs(recorder, self.said.append),  # type: ignore[arg-type]

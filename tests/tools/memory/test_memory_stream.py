@@ -29,23 +29,26 @@ def readings(view_mib_per_h: float, hours: float = 8.0, feed_mib_per_h: float = 
 
 class TestGrowth:
     def test_a_steady_view_is_within_the_limit(self) -> None:
-        result = judge(readings(0.1))
+        result = judge(readings(0.1), 8.0)
         assert result["ok"] and result["hours"] == pytest.approx(8.0, abs=0.01) and result["dropped"] == 3
         assert result["mib_per_h"]["view"]["private_dirty"]["per_h"] == pytest.approx(0.1, abs=0.01)
 
     @pytest.mark.parametrize(("view", "feed"), [(1.2, 0.0), (0.0, 1.2)])
     def test_growth_of_either_process_fails(self, view: float, feed: float) -> None:
-        assert not judge(readings(view, feed_mib_per_h=feed))["ok"]
+        assert not judge(readings(view, feed_mib_per_h=feed), 8.0)["ok"]
 
     def test_growth_of_the_first_half_does_not_count(self) -> None:
         late = readings(0.0)
         for number, one in enumerate(late[: len(late) // 2]):
             one["view"]["private_dirty"] -= (len(late) // 2 - number) * 100_000
-        assert judge(late)["ok"]
+        assert judge(late, 8.0)["ok"]
 
     @pytest.mark.parametrize("found", [[], readings(0.0)[:5]])
     def test_too_few_readings_show_nothing(self, found: list[dict[str, Any]]) -> None:
-        assert not judge(found)["ok"]
+        assert not judge(found, 0.001)["ok"]
+
+    def test_a_stream_that_ended_early_shows_nothing(self) -> None:
+        assert not judge(readings(0.0), 9.0)["ok"]
 
 
 class TestRecording:
