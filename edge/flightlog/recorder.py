@@ -205,7 +205,7 @@ class Recorder:
 
     def _run(self, file: PartFile) -> None:
         with contextlib.suppress(OSError):
-            # Linux niceness is per thread: the control thread gets the core first.
+            # For ordinary scheduling; Linux niceness is per thread.
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
         try:
             self._write_all(self._begin(file))

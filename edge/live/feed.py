@@ -107,7 +107,7 @@ class RecordFeed:
 
     def _run(self) -> None:
         with contextlib.suppress(OSError):
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)  # per thread on Linux
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)  # for ordinary scheduling
         while not self._closing.wait(_PERIOD_S) and not self._broken:
             self._send_all()
         self._send_all()
