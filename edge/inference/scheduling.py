@@ -71,7 +71,7 @@ class Schedule:
     """Threads that read the robot, record or print."""
     reasoning: Role
     workers: Role
-    """Further threads of the language model's graphs; above reasoning, which spins until they have ended."""
+    """Further threads of the language model's graphs; on the same cores above reasoning, which spins until they end."""
     shared: bool
     """Whether reasoning can occupy a tick's core or accelerator, so that it has to wait for ticks."""
     notes: tuple[str, ...] = ()
@@ -139,7 +139,8 @@ def make_schedule(
         control=Role("control", tuple(sorted(control)), control_priority, CONTROL_NICENESS),
         inputs=Role("inputs", priority=inputs_priority),
         reasoning=Role("reasoning", cores, lowest, REASONING_NICENESS),
-        workers=Role("reasoning's graphs", cores, None if lowest is None else lowest + 1, REASONING_NICENESS),
+        # Without cores of their own they stay ordinary: an operator's stop must not wait for a core.
+        workers=Role("reasoning's graphs", cores, lowest + 1 if lowest and cores else None, REASONING_NICENESS),
         shared=one_device or len(free) < control_threads,
         notes=tuple(notes),
     )

@@ -201,6 +201,10 @@ class TestInterpreter:
         assert made.control.priority == control
         assert [role.priority for role in (made.inputs, made.workers, made.reasoning)] == others
 
+    def test_without_cores_of_its_own_reasoning_fills_one_core_at_most(self) -> None:
+        made = schedule(range(2))
+        assert (made.reasoning.cores, made.reasoning.priority, made.workers.priority) == ((), 30, None)
+
     def test_where_controls_priority_is_refused_no_thread_has_one_and_a_line_says_so(
         self, artifacts: Artifacts, monkeypatch: pytest.MonkeyPatch
     ) -> None:
