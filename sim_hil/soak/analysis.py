@@ -37,6 +37,8 @@ ODOMETRY_HZ: Final = 2.0
 _WIRE_GAP_NS: Final = 500_000_000
 """Largest gap between two commands of one run of the bridge; across a longer gap the bridge was not armed."""
 _REPEAT_NS: Final = 20_000_000
+_STOP_REQUEST: Final = "StopMove"
+"""The request that stops a Unitree robot; the bridge then waits for the robot before it commands again."""
 
 
 @dataclass
@@ -126,6 +128,7 @@ def read_trace(path: Path) -> TraceData:
     stamps: list[int] = []
     poses: list[tuple[float, float, float]] = []
     sent: list[int] = []
+    stops: list[bool] = []
     near: list[tuple[int, float]] = []
     contacts: list[tuple[int, str]] = []
     touched: set[str] = set()
@@ -140,6 +143,7 @@ def read_trace(path: Path) -> TraceData:
         elif kind == "wire" and line["velocity"] is not None:
             # The bridge's own send time where the protocol has one; the receive time includes the simulator's delays.
             sent.append(int(line["request_id"] or line["t_ns"]))
+            stops.append(line["name"] == _STOP_REQUEST)
         elif kind == "people" and poses and line["poses"]:
             x, y = poses[-1][:2]
             near.append((line["t_ns"], min(hypot(p[0] - x, p[1] - y) for p in line["poses"])))
@@ -147,7 +151,7 @@ def read_trace(path: Path) -> TraceData:
             end = line
     at = np.array(sent, np.int64)
     gaps = np.diff(at)
-    kept = (gaps > _REPEAT_NS / 4) & (gaps < _WIRE_GAP_NS)
+    kept = (gaps > _REPEAT_NS / 4) & (gaps < _WIRE_GAP_NS) & ~np.array(stops[:-1], bool)
     return TraceData(
         np.array(stamps, np.int64),
         np.array(poses, float).reshape(-1, 3),
