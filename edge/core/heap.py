@@ -1,8 +1,9 @@
-"""Keeps the C library's heap from growing over hours of blocks whose sizes change."""
+"""Keeps a process's memory from growing over hours: the C library's heap, and garbage of Python in cycles."""
 
 from __future__ import annotations
 
 import ctypes
+import gc
 from collections.abc import Callable
 from typing import Final
 
@@ -32,3 +33,15 @@ def keep_large_blocks_apart(mallopt: Callable[[int, int], bool] = _mallopt) -> b
     before threads start.
     """
     return mallopt(_M_MMAP_THRESHOLD, LARGE_BYTES) and mallopt(_M_TRIM_THRESHOLD, TRIM_BYTES)
+
+
+def freeze_garbage() -> None:
+    """Collect garbage once, then exclude all present objects from later collections, which become short and frequent.
+
+    Python collects old garbage when the objects that are new to it are a quarter of what its last collection visited.
+    The second collection here visits nothing; without it, the next one waits for a quarter of all modules' objects:
+    in the live view an hour of closed connections.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.collect()

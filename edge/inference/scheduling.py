@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import gc
 import math
 import os
 import resource
@@ -17,6 +16,7 @@ from typing import TypeVar
 from edge.artifacts.manifest import Artifacts
 from edge.core.deadline import run_in_thread
 from edge.core.device import shares_device
+from edge.core.heap import freeze_garbage
 
 Result = TypeVar("Result")
 
@@ -249,12 +249,6 @@ def lock_memory(
     if number:
         return f"memory is not locked ({os.strerror(number)}): a tick may wait for a page from disk"
     return None
-
-
-def freeze_garbage() -> None:
-    """Collect garbage once, then exclude all present objects from later collections."""
-    gc.collect()
-    gc.freeze()
 
 
 class TickActivity:

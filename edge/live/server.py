@@ -24,6 +24,7 @@ from typing import Final
 
 from aiohttp import WSCloseCode, WSMsgType, web
 
+from edge.core.heap import freeze_garbage, keep_large_blocks_apart
 from edge.flightlog.part import encode
 from edge.flightlog.schemas import ANY_OBJECT, SCHEMAS
 from edge.flightlog.standard_messages import StandardMessages
@@ -308,6 +309,7 @@ async def serve(runner: socket.socket) -> None:
         runner.send(wire.Datagram(wire.REFUSED, why.encode()).encode())
         await serving.cleanup()
         return
+    freeze_garbage()
     port = serving.addresses[0][1]
     runner.send(wire.Datagram(wire.LISTENING, str(port).encode()).encode())
     while data := await loop.sock_recv(runner, wire.MOST_BYTES):
@@ -322,6 +324,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(argv)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the runner, whose end ends this process
     os.nice(_NICENESS)
+    keep_large_blocks_apart()
     resource.setrlimit(resource.RLIMIT_NOFILE, (_MOST_FILES, _MOST_FILES))
     with contextlib.suppress(OSError), socket.socket(fileno=args.fd) as runner:
         asyncio.run(serve(runner))
