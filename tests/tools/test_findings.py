@@ -16,7 +16,7 @@ from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.conditions.latency import LatencyProfile
 from sim_hil.benchmark.conditions.rewording import reworded
 from sim_hil.benchmark.results.record import EpisodeResult, ResultError
-from sim_hil.benchmark.results.store import ResultStore
+from sim_hil.benchmark.results.store import ResultStore, StoreError
 from sim_hil.benchmark.runs import RunsError
 from sim_hil.benchmark.suite.episode import Episode, load_suite
 from sim_hil.scene.scene import load_scene
@@ -233,9 +233,10 @@ def test_an_interrupted_run_is_reported_as_far_as_it_has_results(
     ("ends", "code"),
     [
         (RunsError("two episodes have no result"), EXIT_CHECK_FAILED),
+        (StoreError("expected the code of the run, found other code"), EXIT_CHECK_FAILED),
         (ConditionsError("swapped instructions: expected two tasks or more in hall, found 1"), EXIT_DONE),
     ],
-    ids=["a run that lacks episodes", "a run that does not suit"],
+    ids=["a run that lacks episodes", "a run of other code", "a run that does not suit"],
 )
 def test_one_failed_run_does_not_end_the_others(
     ends: Exception, code: int, tmp_path: Path, suite: Path, monkeypatch: pytest.MonkeyPatch

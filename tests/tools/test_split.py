@@ -12,12 +12,13 @@ import pytest
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE
 from edge.core.geometry import SE2
 from edge.reasoning.decoding_rules import ONWARD, DecodingContext, TurnDistances
+from edge.reasoning.prompt import InstructionError
 from edge.state.reasoning_text import Plan, Progress, ReasoningText, SeenObject, Situation, Stop, Turn, format_text
 from sim_hil.benchmark.results.store import StoreError
 from tests.support.benchmark import dynanav_fakes as fakes
-from tools.findings import split
+from tools.findings import split, split_worker
 from tools.findings.split_policies import VARIANTS, TrueDistances, TrueProgress, WholeText, _dense
-from tools.findings.split_worker import result_path, scenario_of
+from tools.findings.split_worker import SplitJob, code, messages, result_path, scenario_of
 
 END = 7
 TRUTH = ReasoningText(
@@ -82,6 +83,7 @@ def test_scenarios_are_of_the_benchmarks_buildings_and_of_a_seed_that_no_stage_u
     scenario = scenario_of(3)
     assert scenario.kind in ("hospital", "office", "warehouse") and scenario.layout_seed >= 100
     assert scenario.episode == scenario_of(3).episode
+    assert len({scenario_of(number).layout_seed for number in range(4)}) == 4
 
 
 def store(out: Path, variant: str, reached: str) -> None:
@@ -127,6 +129,50 @@ def test_a_run_of_other_artifacts_or_latency_is_not_continued(tmp_path: Path) ->
         split.check_same_run(tmp_path, "b" * 64, 1.0)
 
 
+def job(folder: Path, *variants: str, version: str | None = None) -> dict[str, Any]:
+    """A job as a worker reads it from its standard input."""
+    return json.loads(json.dumps(vars(SplitJob(str(folder), "a", 1.0, 3, variants, "0" * 64, version or code()))))
+
+
+def test_a_worker_goes_on_after_a_variant_that_cannot_be_driven(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def drive(order: SplitJob, scenario: object, name: str) -> Any:
+        if name == "expert-text":
+            raise InstructionError("too long")
+        return fakes.result("e3")
+
+    monkeypatch.setattr(split_worker, "scenario_of", lambda number: None)
+    monkeypatch.setattr(split_worker, "run_variant", drive)
+    first, second = messages(job(tmp_path, "expert-text", "ours"))
+    assert first == {"failed": "expert-text", "why": "too long"}
+    assert second["done"] == "ours" and result_path(tmp_path, "ours", 3).is_file()
+
+
+def test_a_worker_with_other_code_than_the_runs_drives_nothing(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="code has changed"):
+        next(iter(messages(job(tmp_path, "ours", version="0" * 64))))
+
+
+def test_results_of_another_task_are_not_paired(tmp_path: Path) -> None:
+    store(tmp_path, "ours", "01")
+    store(tmp_path, "expert-text", "11")
+    path = result_path(tmp_path, "expert-text", 1)
+    path.write_text(path.read_text().replace('"task": "', '"task": "another-'))
+    with pytest.raises(StoreError, match=r"expert-text/0001\.json"):
+        split.table(tmp_path)
+
+
+def test_the_rates_of_each_kind_of_building_are_given(tmp_path: Path) -> None:
+    store(tmp_path, "ours", "01")
+    for number, scene in enumerate(("office-123", "warehouse-7")):
+        path = result_path(tmp_path, "ours", number)
+        path.write_text(json.dumps({**json.loads(path.read_text()), "scene": scene}))
+    content = split.table(tmp_path)
+    assert content["variants"]["ours"]["sr_by_kind"] == {"hospital": None, "office": 0, "warehouse": 100}
+    assert "| SR hospital | SR office | SR warehouse |" in split.markdown(content)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -150,5 +196,5 @@ def test_the_plan_of_a_stop_gets_the_true_distance() -> None:
     assert decode(found or ()) == "Plan: stop in 3 m.\n"
 
 
-def test_every_variant_says_what_it_replaces() -> None:
-    assert len({variant.says for variant in VARIANTS.values()}) == len(VARIANTS) == 8
+def test_every_variant_has_a_description_of_its_own() -> None:
+    assert len({variant.description for variant in VARIANTS.values()}) == len(VARIANTS) == 10

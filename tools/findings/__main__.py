@@ -123,14 +123,14 @@ def _main(args: argparse.Namespace) -> int:
             _print(line)
         return EXIT_DONE
     args.out.mkdir(parents=True, exist_ok=True)
-    broken: list[RunsError] = []
+    broken: list[RunsError | StoreError] = []
     unfit: dict[str, str] = {}
     try:
         with stop_signals() as stop:
             for name in dict.fromkeys(plan.folders.values()):
                 try:
                     _run(args, name, plan.conditions[name], episodes, stop)
-                except RunsError as error:  # continue: the other runs are still useful
+                except (RunsError, StoreError) as error:  # continue: the other runs, and its results, are still useful
                     broken.append(error)
                     _print(str(error))
                 except ConditionsError as error:  # impossible with this suite or this model

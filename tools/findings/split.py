@@ -38,10 +38,10 @@ from sim_hil.benchmark.results.bootstrap import paired_ci95
 from sim_hil.benchmark.results.record import EpisodeResult, ResultError
 from sim_hil.benchmark.results.store import StoreError
 from sim_hil.benchmark.results.summary import BOUNDS, METRICS, interval_of
-from sim_hil.benchmark.workers.code_version import code_sha256
+from sim_hil.benchmark.suite.strata import kind_of
 from sim_hil.benchmark.workers.worker_pool import WorkerJob, Workers
 from tools.findings.split_policies import VARIANTS
-from tools.findings.split_worker import KINDS, MODULE, SCENARIO_SEED, SplitJob, result_path
+from tools.findings.split_worker import KINDS, MODULE, SCENARIO_SEED, SplitJob, code, result_path
 
 COMMAND: Final = "split"
 EXAMPLES: Final = """examples:
@@ -57,6 +57,7 @@ exit codes: 0 done, 1 an episode has no result, 2 bad arguments or input, 3 refu
 BASE: Final = "ours"
 SHOWN: Final = ("sr", "cr", "spl")
 ABOUT: Final = "about.json"
+_REACHED: Final = {True: "reached", False: "missed"}
 _print = messages(COMMAND)
 
 
@@ -96,9 +97,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not args.report:
         if args.artifacts is None:
             raise ConditionsError("--artifacts: expected the directory of an exported model, found none")
-        check_same_run(args.out, load_artifacts(args.artifacts).manifest_sha256, args.latency)
+        manifest_sha256 = load_artifacts(args.artifacts).manifest_sha256
+        check_same_run(args.out, manifest_sha256, args.latency)
         try:
-            failed = _run(args, variants)
+            failed = _run(args, variants, manifest_sha256)
         except KeyboardInterrupt:
             interrupted = True
     content = table(args.out)
@@ -127,7 +129,7 @@ def check_same_run(out: Path, manifest_sha256: str, latency_s: float) -> None:
     """Write the run's conditions, or raise StoreError if `out` has a run with others."""
     about = {
         "manifest_sha256": manifest_sha256, "latency_s": latency_s, "scenario_seed": SCENARIO_SEED,
-        "kinds": dict(KINDS), "code": code_sha256(),
+        "kinds": dict(KINDS), "code": code(),
     }  # fmt: skip
     path = out / ABOUT
     if path.is_file():
@@ -142,21 +144,24 @@ def check_same_run(out: Path, manifest_sha256: str, latency_s: float) -> None:
     write_whole(path, json.dumps(about, indent=1) + "\n")
 
 
-def _run(args: argparse.Namespace, variants: Sequence[str]) -> list[str]:
+def _run(args: argparse.Namespace, variants: Sequence[str], manifest_sha256: str) -> list[str]:
     """Drive what is missing; return the keys of jobs that failed. Raises KeyboardInterrupt when asked to stop."""
     waiting: deque[WorkerJob] = deque()
+    folder, artifacts, version = str(args.out.absolute()), str(args.artifacts.absolute()), code()
     for number in range(args.episodes):
         missing = tuple(name for name in variants if not result_path(args.out, name, number).is_file())
         if missing:
-            job = SplitJob(str(args.out.absolute()), str(args.artifacts.absolute()), args.latency, number, missing)
+            job = SplitJob(folder, artifacts, args.latency, number, missing, manifest_sha256, version)
             waiting.append(WorkerJob(f"{number:04d}", vars(job), args.out / f"{number:04d}.log"))
     failed: list[str] = []
     with stop_signals() as stop, Workers((sys.executable, "-m", MODULE), args.jobs) as workers:
         for events in workers.run(waiting, lambda: bool(stop)):
             for event in events:
-                if event.message is not None:
-                    said = event.message
-                    _print(f"{event.key} {said['done']}: {'reached' if said['success'] else 'missed'}")
+                if event.message is not None and "done" in event.message:
+                    _print(f"{event.key} {event.message['done']}: {_REACHED[bool(event.message['success'])]}")
+                elif event.message is not None:
+                    failed.append(event.key)
+                    _print(f"{event.key} {event.message['failed']}: {event.message['why']}")
                 elif event.failure:
                     failed.append(event.key)
                     _print(f"{event.key}: {event.failure}")
@@ -175,14 +180,19 @@ def read_variant(out: Path, variant: str) -> dict[str, EpisodeResult]:
 
 
 def table(out: Path) -> dict[str, Any]:
-    """Return every variant's rates, and their paired differences to `ours`, with 95 % intervals."""
+    """Return every variant's rates and their paired differences to `ours` with 95 % intervals, and rates by building.
+
+    Raises StoreError for results of one number that are of different tasks.
+    """
     base = read_variant(out, BASE)
     variants: dict[str, Any] = {}
     for name, variant in VARIANTS.items():
         results = read_variant(out, name)
         if not results:
             continue
-        row: dict[str, Any] = {"says": variant.says, "episodes": len(results)}
+        if other := [number for number in set(results) & set(base) if results[number].task != base[number].task]:
+            raise StoreError(f"{out}: {name}/{other[0]}.json is of another task than {BASE}'s; delete one of them")
+        row: dict[str, Any] = {"description": variant.description, "episodes": len(results)}
         row["delay_s"] = _mean([each.delay_s["mean"] for each in results.values() if each.delay_s is not None])
         common = sorted(set(results) & set(base))
         for key in SHOWN:
@@ -194,6 +204,10 @@ def table(out: Path) -> dict[str, Any]:
             row[f"{key}_gain"] = _mean([b - a for a, b in zip(before, after, strict=True)])
             row[f"{key}_gain_ci95"] = paired_ci95(before, after, tasks, BOUNDS[key])
         row["pairs"] = len(common)
+        row["sr_by_kind"] = {
+            kind: _mean([METRICS["sr"](each) for each in results.values() if kind_of(each.scene) == kind])
+            for kind in KINDS
+        }
         variants[name] = row
     return {"base": BASE, "variants": variants, "tagged": "measured"}
 
@@ -205,13 +219,17 @@ def _mean(values: Sequence[float]) -> float | None:
 def markdown(content: Mapping[str, Any]) -> str:
     """Return the table as a page of Markdown."""
     lines = [
-        "| variant | what is replaced | n | SR % | CR % | SPL % | SR less that of ours | CR less | SPL less |",
-        "|---|---|---:|---:|---:|---:|---:|---:|---:|",
+        f"| variant | what is replaced | n | SR % | CR % | SPL % | SR less that of ours | CR less | SPL less |"
+        f" {' | '.join(f'SR {kind}' for kind in KINDS)} |",
+        f"|---|---|{'---:|' * (7 + len(KINDS))}",
     ]
     for name, row in content["variants"].items():
         rates = [_cell(row[key], row[f"{key}_ci95"], "") for key in SHOWN]
         gains = ["" if name == BASE else _cell(row[f"{key}_gain"], row[f"{key}_gain_ci95"], "+") for key in SHOWN]
-        lines.append(f"| `{name}` | {row['says']} | {row['episodes']} | {' | '.join([*rates, *gains])} |")
+        kinds = [_cell(row["sr_by_kind"][kind], None, "") for kind in KINDS]
+        lines.append(
+            f"| `{name}` | {row['description']} | {row['episodes']} | {' | '.join([*rates, *gains, *kinds])} |"
+        )
     return "\n".join(lines) + "\n"
 
 

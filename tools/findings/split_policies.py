@@ -37,7 +37,7 @@ from edge.state.reasoning_text import (
     format_text,
     parse_text,
 )
-from edge.state.switches import Speculation
+from edge.state.switches import Decoding, Speculation
 from sim_hil.benchmark.env.observation import Observation
 from sim_hil.benchmark.env.world import EpisodeWorld
 from sim_hil.benchmark.policies.artifacts_policy import ArtifactsPolicy
@@ -63,11 +63,12 @@ _STEER: Final = CollectConfig(wall_m=0.1)  # the teacher's driving, as in the re
 
 @dataclass(frozen=True)
 class Variant:
-    """One replaced link; `told`: what of the text is the truth; `drives`: whether the expert drives by the text."""
+    """One replaced link; `forced_text`: which of the text is the truth; `drives`: the expert drives by the text."""
 
-    says: str
-    told: Callable[[DecodingContext, Encode, ReasoningText, int], TextConstraint] | None = None
+    description: str
+    forced_text: Callable[[DecodingContext, Encode, ReasoningText, int], TextConstraint] | None = None
     drives: bool = False
+    decoding: Decoding | None = None
     people: bool = True
     drift: str = "none"
 
@@ -150,10 +151,13 @@ def _at_true_distance(plan: Plan, truth: Plan) -> Plan:
 VARIANTS: Final[Mapping[str, Variant]] = MappingProxyType(
     {
         "ours": Variant("our text, our action expert"),
-        "expert-text": Variant("the true text, read by our language model; our action expert", told=WholeText),
+        "expert-text": Variant("the true text, read by our language model; our action expert", forced_text=WholeText),
         "expert-driving": Variant("our text; the expert drives along its waypoints", drives=True),
-        "true-progress": Variant("our text with the true progress", told=TrueProgress),
-        "true-distances": Variant("our text with true objects, openings and distances", told=TrueDistances),
+        "expert-text-driving": Variant("the true text; the expert drives along its waypoints",
+                                       forced_text=WholeText, drives=True),
+        "free-decoding": Variant("our text without decoding rules", decoding=Decoding.FREE),
+        "true-progress": Variant("our text with the true progress", forced_text=TrueProgress),
+        "true-distances": Variant("our text with true objects, openings and distances", forced_text=TrueDistances),
         "no-people": Variant("as ours, without people", people=False),
         "typical-drift": Variant("as ours, with typical odometry drift; all others have perfect odometry",
                                  drift="typical"),
@@ -195,17 +199,19 @@ class TrueTexts:
 
 
 class _TruthfulLanguage(LanguageModel):
-    """A language model that is told the truth about the newest frame of each generation."""
+    """Language model whose decoding is forced to the truth of each generation's newest frame."""
 
     variant: Variant = VARIANTS["ours"]
     truth: ReasoningText | None = None
 
     def constraint(self, context: DecodingContext) -> TextConstraint:
         """Return the constraint that states the truth."""
-        told, end_id = self.variant.told, self.runtime.im_end_id
-        if told is None or self.truth is None:
+        forced, end_id = self.variant.forced_text, self.runtime.im_end_id
+        if forced is None or self.truth is None:
             return super().constraint(context)
-        return told(context, lambda text: self.tokenizer.encode(text, add_special_tokens=False).ids, self.truth, end_id)
+        return forced(
+            context, lambda text: self.tokenizer.encode(text, add_special_tokens=False).ids, self.truth, end_id
+        )
 
 
 class SplitPolicy(ArtifactsPolicy):
@@ -216,13 +222,13 @@ class SplitPolicy(ArtifactsPolicy):
     def begin(self, variant: Variant, scenario: Scenario) -> None:
         """Choose the replaced link; call it before `reset`."""
         self._variant = variant
-        self._texts = None if variant.told is None else TrueTexts(scenario)
-        if variant.told is not None:
-            self._teller = _TruthfulLanguage(self._artifacts, threads=1)
-            self._teller.variant = variant
+        self._texts = None if variant.forced_text is None else TrueTexts(scenario)
+        if variant.forced_text is not None:
+            self._truthful = _TruthfulLanguage(self._artifacts, threads=1)
+            self._truthful.variant = variant
             if self._switches.speculation is Speculation.ON:
-                self._teller.speculate()
-            self.language = self._teller
+                self._truthful.speculate()
+            self.language = self._truthful
         self._pilot: _Pilot | None = None
 
     def reset(self, episode: Episode, instruction: str, world: object | None, seed: int) -> None:
@@ -241,7 +247,7 @@ class SplitPolicy(ArtifactsPolicy):
         if self._texts is not None:
             self._texts.watch(observation)
             if begins:
-                self._teller.truth = self._texts.text()
+                self._truthful.truth = self._texts.text()
         return command if self._pilot is None else self._pilot.command(observation, notes, begins=begins)
 
 

@@ -5,24 +5,31 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
+import tools.findings
+import tools.train
+from edge.artifacts.files import ArtifactError
 from edge.core.cli import write_whole
+from edge.reasoning.prompt import InstructionError
+from edge.state.switches import SwitchOptions
 from export.core.typed import build
 from sim_hil.benchmark.conditions.conditions import Conditions, PolicySpec
 from sim_hil.benchmark.conditions.latency import LatencyProfile
 from sim_hil.benchmark.policies.policy import Policy
 from sim_hil.benchmark.policies.select import open_policy, robot_config
 from sim_hil.benchmark.results.record import EpisodeResult
-from sim_hil.benchmark.results.store import EPISODES
+from sim_hil.benchmark.results.store import EPISODES, StoreError
+from sim_hil.benchmark.workers.code_version import code_sha256
 from sim_hil.benchmark.workers.run_episode import drive
 from sim_hil.benchmark.workers.task import EpisodeTask
 from sim_hil.benchmark.workers.worker_process import worker_main
 from sim_hil.processes.child_process import Message
+from sim_hil.scene.table import SceneError
 from tools.findings.split_policies import VARIANTS, SplitPolicy
 from tools.train.drives.scenarios import KEPT_SEEDS, Scenario, training_episodes
 
@@ -35,18 +42,28 @@ EXPERT: Final = "expert"
 
 @dataclass(frozen=True)
 class SplitJob:
-    """Scenario `number` to be driven in `variants`; results go into `folder`/VARIANT/ID.json."""
+    """Scenario `number` to be driven in `variants`; results go into `folder`/VARIANT/NUMBER.json.
+
+    `manifest_sha256`, `code`: artifacts and code that began the run; with others the job is refused.
+    """
 
     folder: str
     artifacts: str
     latency_s: float
     number: int
-    variants: Sequence[str]
+    variants: tuple[str, ...]
+    manifest_sha256: str
+    code: str
 
 
 def scenario_of(number: int) -> Scenario:
-    """Return a scenario of a kept seed, on which nothing is trained."""
-    return next(iter(training_episodes(SCENARIO_SEED, 1, KINDS, start=number)))
+    """Return a scenario of a kept seed, on which nothing is trained; each has a layout of its own."""
+    return next(iter(training_episodes(SCENARIO_SEED, 1, KINDS, start=number, tasks_per_scene=1)))
+
+
+def code() -> str:
+    """Return the SHA-256 of all code that computes a result: simulation, robot, and what writes the true texts."""
+    return code_sha256(tools.findings, tools.train)
 
 
 def result_path(folder: Path, variant: str, number: int) -> Path:
@@ -55,11 +72,20 @@ def result_path(folder: Path, variant: str, number: int) -> Path:
 
 
 def messages(job: Message) -> Iterator[Mapping[str, Any]]:
-    """Drive a job; yield `{"done": variant, "success": …}` after each variant."""
+    """Drive a job; yield `{"done": variant, "success": …}`, or `{"failed": variant, "why": …}`, after each variant.
+
+    Raises StoreError if the code is not that of the run.
+    """
     order = build(SplitJob, job, "job")
+    if code() != order.code:
+        raise StoreError("the code has changed since the run began; name another directory")
     scenario = scenario_of(order.number)
     for name in order.variants:
-        result = run_variant(order, scenario, name)
+        try:
+            result = run_variant(order, scenario, name)
+        except (InstructionError, SceneError, ValueError) as error:  # the later variants do not need this one
+            yield {"failed": name, "why": str(error)}
+            continue
         path = result_path(Path(order.folder), name, order.number)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, json.dumps(result.as_json()) + "\n")
@@ -78,17 +104,20 @@ def run_variant(order: SplitJob, scenario: Scenario, name: str) -> EpisodeResult
         latency = LatencyProfile.constant(order.latency_s)
         spec = PolicySpec("artifacts", order.artifacts)
         conditions = Conditions(spec, mode="async", latency=latency, drift=variant.drift)
-    with closing(_policy(conditions, scenario, name)) as policy:
+    with closing(_policy(order, conditions, scenario, name)) as policy:
         task = EpisodeTask(episode, conditions, folder)
         return drive(task, policy, lambda _: None, started_ns=started_ns, scene=scenario.scene)
 
 
-def _policy(conditions: Conditions, scenario: Scenario, name: str) -> Policy:
+def _policy(order: SplitJob, conditions: Conditions, scenario: Scenario, name: str) -> Policy:
     if name == EXPERT or conditions.latency is None:
         return open_policy(conditions)
     policy = SplitPolicy(
-        Path(conditions.policy.where), mode="async", latency=conditions.latency, robot=robot_config()
+        Path(conditions.policy.where), mode="async", latency=conditions.latency, robot=robot_config(),
+        switches=SwitchOptions(decoding=VARIANTS[name].decoding),
     )  # fmt: skip
+    if policy.manifest_sha256 != order.manifest_sha256:
+        raise ArtifactError(f"{order.artifacts}: expected the artifacts that began the run; name another directory")
     policy.begin(VARIANTS[name], scenario)
     return policy
 
