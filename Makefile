@@ -30,8 +30,8 @@ help:
 	@echo "            LIVE=1: with a live view in the browser, whose address is printed"
 	@echo "            ROBOT=carter-can, carter-mavlink or carter-ros2: another robot and protocol than the go2's"
 	@echo "make demos  the demo with ten seeds (about 15 min); out/demos/SEED/report.html"
-	@echo "make nano   train the shipped model from nothing into out/nano-run (hours; Ctrl-C and again goes on)"
-	@echo "make faults inject every fault into real processes, some 230 times (about 15 min), and write out/faults/"
+	@echo "make nano   train nano from nothing into out/nano-run; weights and card in its folder ship (hours; Ctrl-C and again goes on)"
+	@echo "make faults inject faults into real processes, some 250 times (about 15 min), and write out/faults/"
 	@echo "make faults PER_ROW=20 LOAD=2  each fault 20 times beside two busy processes; resumes; the table: python -m tools.faults --table out/faults"
 	@echo "make contract  faults of link, bridge and runner on every robot, 20 times each, into out/contract/ (an hour; resumes)"
 	@echo "make test   lint, type-check and run the fast tests (less than 5 min on 2 cores)"
@@ -72,7 +72,8 @@ demos: .venv/.demo-installed
 # Every stage of tools/train/config/recipes/nano.toml; a second call goes on where the first was ended. The plan: --dry-run.
 nano: .venv/.demo-installed
 	@OMP_NUM_THREADS=$$(( ($$(nproc) + 1) / 2 )) $(BIN)/torchrun --nproc-per-node 2 -m tools.train.cli all --preset nano --out out/nano-run --resume
-	@$(BIN)/edge-train card --out out/nano-run --ship export/weights
+	@$(BIN)/edge-train card --out out/nano-run --ship out/nano-run/ship
+	@echo "make: weights and card are in out/nano-run/ship; measure them, then publish: edge-train card --out out/nano-run --scores RESULT.json --ship export/weights"
 
 # The demo's artifacts, if they are there; otherwise its own. make faults PER_ROW=20: a second call goes on where the first
 # was ended; delete out/faults after a change of the code. LOAD=2: beside two busy processes.

@@ -17,6 +17,7 @@ from export.model.network import PARTS
 from export.model.weights import WeightsInfo, save_weights
 from firmware_bridge.system.input_file import read_json
 from reporting.progress import duration
+from sim_hil.benchmark.conditions.conditions import Conditions
 from tools.train.config.checks import TrainError
 from tools.train.config.recipe import STAGES, Recipe
 from tools.train.drives.drive import file_sha256
@@ -30,6 +31,7 @@ _PART_NAMES: Final = dict(
 _HEADINGS: Final = ("## ", "### ", "#### ", "##### ")  # Markdown has six levels
 _THEIRS: Final = "It began with weights of others (`--checkpoint`), whose licence holds for it."
 _BEFORE: Final = "## What it went on from"
+_SHIPPED_RECIPE: Final = ".recipe.toml"
 _OUR_DRIVES: Final = (
     "Drives of a privileged expert in simulated training scenes, made by this repository's own code: generated",
     "layouts, the demo's corridor, crowds and instruction patterns. A test checks that none of them occurs in the",
@@ -80,7 +82,7 @@ def ship(run_dir: RunDir, recipe: Recipe, folder: Path, scores: Sequence[Path] =
     info = WeightsInfo(trained=about["trained"] == "true", origin=f"{about['origin']}, float16")
     save_weights(model, path, info, parts=[part for part in PARTS if part != "value"])
     write_whole(path.with_suffix(".md"), card(run_dir, recipe, path, [score(each) for each in scores]))
-    write_whole(path.with_suffix(".recipe.toml"), run_dir.recipe_path.read_text(encoding="utf-8"))
+    write_whole(path.with_suffix(_SHIPPED_RECIPE), run_dir.recipe_path.read_text(encoding="utf-8"))
     return path
 
 
@@ -90,12 +92,13 @@ def card(run_dir: RunDir, recipe: Recipe, weights: Path, scores: Sequence[Mappin
     results = {name: result for name, result in found.items() if ADOPTED not in result}
     after = next((str(result.get("after")) for result in found.values() if ADOPTED in result), None)
     before, imported = _card_before(run_dir), results.get("collect", {}).get(IMPORTED) is True
+    recipe_file = run_dir.recipe_path if weights == run_dir.model_path else weights.with_suffix(_SHIPPED_RECIPE)
     blocks = [
         f"# {recipe.name}: weights for tic-vla-edge\n",
         _network(weights, recipe, _licence(run_dir.begun(START), before)),
         "## Scores\n\n" + _scores(results.get("evaluate"), scores),
         "## Data\n\n" + _data(run_dir, results.get("collect")),
-        "## Training\n\n" + _training(run_dir, recipe, results, after),
+        "## Training\n\n" + _training(run_dir, recipe, results, after, recipe_file),
         "## Limits\n\n" + (_LIMITS_ELSEWHERE if imported else _LIMITS_HERE) + LIMITS,
         *([] if before is None else [f"{_BEFORE}\n\n{_history(before)}"]),
     ]
@@ -126,9 +129,14 @@ def score(path: Path) -> dict[str, Any]:
     """Read conditions and summary of a benchmark's result file. Raises TrainError."""
     try:
         content = read_json(path)
-        return {key: content[key] for key in ("suite", "conditions", "summary", "latency", "trained")}
+        found = {key: content[key] for key in ("suite", "conditions", "summary", "latency", "trained")}
+        found["conditions"] = Conditions.of_json(content["conditions"])
+        finished = content["summary"]["finished"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TrainError(f"--scores {path}: expected a result.json of edge-bench ({error!r})") from error
+    if not finished:
+        raise TrainError(f"--scores {path}: expected a finished run; continue it with edge-bench --resume")
+    return found
 
 
 def parameters(weights: Path) -> dict[str, int]:
@@ -154,10 +162,9 @@ def _network(weights: Path, recipe: Recipe, licence: str) -> str:
 def _scores(evaluation: Mapping[str, Any] | None, scores: Sequence[Mapping[str, Any]]) -> str:
     rows = []
     for each in scores:
-        conditions = each["conditions"]
-        latency = each["latency"].get("profile") or "none"
-        settings = f"{conditions['clock']}, {conditions['mode']}, latency {latency}, drift {conditions['drift']}"
-        rows.append(_row(f"{Path(each['suite']).stem}, {settings}", each["summary"]))
+        delay_s = (each["latency"].get("delay_s") or {}).get("mean")
+        delay = "" if delay_s is None else f", mean Δt {delay_s:.2f} s"
+        rows.append(_row(f"{Path(each['suite']).stem}, {each['conditions'].describe()}{delay}", each["summary"]))
     if evaluation is not None:
         where = f"unseen training scenes, lockstep, async, latency {evaluation['latency_s']:g} s"
         rows.append(_row(where, evaluation["summary"]))
@@ -192,7 +199,9 @@ def _data(run_dir: RunDir, collected: Mapping[str, object] | None) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _training(run_dir: RunDir, recipe: Recipe, results: Mapping[str, Any], after: str | None) -> str:
+def _training(
+    run_dir: RunDir, recipe: Recipe, results: Mapping[str, Any], after: str | None, recipe_file: Path
+) -> str:  # fmt: skip
     versions = read_json(run_dir.out / VERSIONS)
     packages = ", ".join(f"{name} {found}" for name, found in versions["packages"].items() if found)
     went_on = " --checkpoint WEIGHTS" if run_dir.begun(START) else ""
@@ -201,9 +210,10 @@ def _training(run_dir: RunDir, recipe: Recipe, results: Mapping[str, Any], after
         went_on += " --drives DATASET"
     if run_dir.borrowed("collect"):
         went_on += " --from RUN"
+    sha256 = file_sha256(run_dir.recipe_path)
     lines = [
-        f"Seed {recipe.seed}; every number is in `recipe.toml` (SHA-256 `{file_sha256(run_dir.recipe_path)}`),",
-        f"made with `edge-train all --recipe recipe.toml{went_on}`. Python {versions['python']}, {packages}.",
+        f"Seed {recipe.seed}; every number is in `{recipe_file.name}` (SHA-256 `{sha256}`),",
+        f"made with `edge-train all --recipe {recipe_file.name}{went_on}`. Python {versions['python']}, {packages}.",
     ]
     if later := versions.get("later"):
         lines.append(f"It was continued with other code, versions or machines {len(later)} times: `{VERSIONS}`.")

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from edge.reasoning.decoding_rules import DecodingContext, TextConstraint
-from edge.state.reasoning_text import AHEAD, WAYPOINT_TIMES_S, ReasoningText, Turn, parse_text
+from edge.state.reasoning_text import AHEAD, WAYPOINT_TIMES_S, ReasoningText, Turn, TurnBack, parse_text
 from export.model.language import LanguageModel
 from tools.train.config.collect import RATE_HZ
 from tools.train.config.sft import EvalConfig
@@ -52,6 +52,10 @@ class Score:
         elif anchor.before(self._gap_s) is not None:
             found["repeats"] += 1
             found["false change"] += progress != anchor.progress
+        said_back, true_back = (_turns_back(text) for text in (answer, anchor.reasoning))
+        found["backs"] += true_back
+        found["backs said"] += said_back
+        found["backs right"] += said_back and true_back
         true_side = side_of(anchor.reasoning)
         if true_side is not None:
             found["sides"] += 1
@@ -78,6 +82,9 @@ class Score:
             "false_change": _share(n["false change"], n["repeats"]),
             "side_right": _share(n["side right"], n["sides"]),
             "sides": n["sides"],
+            "back_recall": _share(n["backs right"], n["backs"]),
+            "back_precision": _share(n["backs right"], n["backs said"]),
+            "backs": n["backs"],
             "landmark_precision": _share(n["landmarks right"], n["landmarks said"]),
             "landmark_recall": _share(n["landmarks right"], n["landmarks there"]),
             "waypoint_error_m": [float(mean) for mean in errors.mean(0)] if len(errors) else None,
@@ -199,6 +206,11 @@ def side_of(text: ReasoningText) -> str | None:
     """Return the side of the planned turn, "left" or "right"; None for another plan."""
     action = None if text.plan is None else text.plan.action
     return action.side if isinstance(action, Turn) and action.side != AHEAD else None
+
+
+def _turns_back(text: ReasoningText) -> bool:
+    """Return whether the plan is to turn back: the robot has left its route."""
+    return text.plan is not None and isinstance(text.plan.action, TurnBack)
 
 
 def landmarks_of(text: ReasoningText) -> Counter[str]:

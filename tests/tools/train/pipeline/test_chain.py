@@ -17,6 +17,7 @@ from export.checkpoint.load import shipped_weights
 from export.model.config import PRESETS, with_overrides
 from export.model.network import build
 from export.model.weights import CheckpointError, WeightsInfo, save_weights
+from sim_hil.benchmark.conditions.conditions import Conditions, PolicySpec
 from tools.train import cli
 from tools.train.config.checks import TrainError
 from tools.train.config.collect import DaggerConfig
@@ -349,17 +350,28 @@ def trained(run_dir: RunDir) -> RunDir:
 
 def test_the_card_names_its_data_and_its_scores(trained: RunDir, tmp_path: Path) -> None:
     scores = tmp_path / "result.json"
-    conditions = {"clock": "lockstep", "mode": "async", "drift": "none"}
-    latency = {"profile": "2 s"}
-    content = {"suite": "dynanav", "conditions": conditions, "summary": SCORE, "latency": latency, "trained": True}
-    scores.write_text(json.dumps(content))
+    conditions = Conditions(
+        PolicySpec.parse("artifacts:out/nano"), mode="async", latency=LatencyProfile.constant(2.0), wordings="training"
+    )
+    latency = {"profile": "2 s", "delay_s": {"mean": 3.1}}
+    content = {"suite": "dynanav", "conditions": conditions.as_json(), "latency": latency, "trained": True}
+    scores.write_text(json.dumps({**content, "summary": {**SCORE, "finished": True}}))
     text = write_card(trained, TINY, [scores]).read_text()
     for part in (
-        "SHA-256", "| language model |", "dynanav, lockstep, async, latency 2 s", "61.2 (50.0 to 71.0)", "| 60 |",
+        "SHA-256", "| language model |", "lockstep, async, latency 2 s, training wordings", "mean Δt 3.10 s",
+        "61.2 (50.0 to 71.0)", "| 60 |",
         "* sha256: ab12", "* loss: 0.25", f"Seed {TINY.seed}", "## Limits", "Apache-2.0", "torch 2.",
     ):  # fmt: skip
         assert part in text
     assert card(trained, TINY, trained.model_path) == card(trained, TINY, trained.model_path)
+
+
+def test_scores_of_an_unfinished_run_are_refused(trained: RunDir, tmp_path: Path) -> None:
+    conditions = Conditions(PolicySpec("still")).as_json()
+    content = {"suite": "dynanav", "conditions": conditions, "latency": {}, "trained": True}
+    (tmp_path / "r.json").write_text(json.dumps({**content, "summary": {**SCORE, "finished": False}}))
+    with pytest.raises(TrainError, match="expected a finished run"):
+        write_card(trained, TINY, [tmp_path / "r.json"])
 
 
 def test_a_file_that_is_no_benchmark_result_is_refused(trained: RunDir, tmp_path: Path) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from edge.reasoning.decoding_rules import BACK, EITHER_WAY, FREE, ONWARD, DecodingContext
-from edge.state.reasoning_text import Progress, format_progress, format_text
+from edge.state.reasoning_text import Plan, Progress, ReasoningText, Stop, TurnBack, format_progress, format_text
 from tests.support.train.train_drives import WORDINGS, made_up_drive
 from tools.train.config.sft import EvalConfig
 from tools.train.samples.anchors import Anchor, Drawn, anchors_of
@@ -53,6 +54,18 @@ def test_nothing_is_right_about_a_text_of_another_form(anchors: list[Anchor]) ->
     shares = ("waypoints_parsable", "progress_parsable", "progress_right", "side_right", "landmark_recall")
     assert all(numbers[key] == 0.0 for key in shares)
     assert numbers["landmark_precision"] is None and numbers["waypoint_error_m"] is None
+
+
+def test_turning_back_is_scored_where_it_is_true_and_where_it_is_said(anchors: list[Anchor]) -> None:
+    def with_plan(action: Stop | TurnBack) -> ReasoningText:
+        return replace(anchors[0].reasoning, plan=Plan(action))
+
+    score = Score(2.0)
+    back, on = with_plan(TurnBack()), with_plan(Stop(3))
+    for truth, said in ((back, back), (back, on), (back, on), (on, back), (on, on)):
+        score.add(format_text(said), replace(anchors[0], reasoning=truth))
+    numbers = score.numbers()
+    assert (numbers["backs"], numbers["back_recall"], numbers["back_precision"]) == (3, pytest.approx(1 / 3), 0.5)
 
 
 class Parrot:
