@@ -34,6 +34,8 @@ class Event:
     begin_ns: int
     end_ns: int
     detail: str
+    final: bool = False
+    """Whether it is the stop that only a new arming ends."""
 
     @property
     def seconds(self) -> float:
@@ -44,7 +46,7 @@ class Event:
 def find_events(flight: Flight) -> list[Event]:
     """Return all events in the order of time; the end of a failed run is the last one."""
     detours = detours_by_route(flight) if any(t.route_m is not None for t in flight.truths) else loops(flight)
-    found = [*collisions(flight), *stops(flight), *detours]
+    found = [*collisions(flight), *stops(flight), *detours, *final_stop(flight)]
     found.sort(key=lambda event: event.begin_ns)
     end = {"timeout": TIMEOUT, "fell": FALL}.get(str(flight.result.get("end")))
     if end is not None:
@@ -88,6 +90,17 @@ def stops(flight: Flight) -> list[Event]:
     return found
 
 
+def final_stop(flight: Flight) -> list[Event]:
+    """Return the stop that only a new arming ends, from the last tick to the end of the log; empty without one.
+
+    A fault or the result names its reason; in an episode, time that goes on without ticks shows it without a reason.
+    """
+    silent_s = (flight.end_ns - flight.last_tick_ns) / 1e9 if "end" in flight.result else 0.0
+    if flight.stop_fault is None and not flight.result_faults and silent_s < STOP_S:
+        return []
+    return [Event(STOP, flight.last_tick_ns, flight.end_ns, "the robot was not driven again", final=True)]
+
+
 def _stands(before: RecordedTick, now: RecordedTick) -> bool:
     if before.pose is None or now.pose is None or now.now_ns - before.now_ns < _BACK_NS // 2:
         return True
@@ -119,7 +132,8 @@ def detours_by_route(flight: Flight) -> list[Event]:
             nearest_m, nearest_ns, worst_m = truth.route_m, truth.stamp_ns, 0.0
         worst_m = max(worst_m, truth.route_m - nearest_m)
     if worst_m > DETOUR_M:
-        found.append(_detour(nearest_ns, flight.truths[-1].stamp_ns, worst_m))
+        # Without ticks the robot stands: that time is the final stop's.
+        found.append(_detour(nearest_ns, min(flight.truths[-1].stamp_ns, flight.last_tick_ns), worst_m))
     return found
 
 

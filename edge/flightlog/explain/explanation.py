@@ -30,6 +30,8 @@ class Explanation:
     at_s: float
     steps: tuple[tuple[str, str], ...]
     text: str
+    generation: int | None
+    """Number of the generation of `text`."""
     anchor_frame_ns: int | None
     event_frame_ns: int | None
 
@@ -72,7 +74,8 @@ def _explained(flight: Flight, event: Event, cause: Event) -> Explanation:
     verdict = judge(flight, cause)
     if cause != event:
         at_s = flight.seconds(cause.begin_ns)
-        because = f"most time went to the {cause.kind} at {at_s:.0f} s ({cause.detail}): {verdict.because}"
+        lost = "the run was lost with" if cause.final else "most time went to"
+        because = f"{lost} the {cause.kind} at {at_s:.0f} s ({cause.detail}): {verdict.because}"
         verdict = Verdict(verdict.cause, because, verdict.evidence, verdict.generation)
     ticks = flight.ticks_between(*window(cause)) or flight.ticks[-1:]
     if verdict.generation is not None:
@@ -86,6 +89,7 @@ def _explained(flight: Flight, event: Event, cause: Event) -> Explanation:
         flight.seconds(event.begin_ns),
         _steps(flight, ticks),
         "" if generation is None else generation.text,
+        None if generation is None else generation.number,
         None if generation is None else generation.frames_ns[-1],
         flight.frame_at(cause.begin_ns),
     )

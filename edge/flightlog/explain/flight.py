@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from edge.core.geometry import SE2
 from edge.flightlog.reader import RecordingError, read_messages
 from edge.flightlog.replay.records import RecordedGeneration, RecordedTick, read_events, read_run
 from edge.flightlog.standard_messages import Mount
+from edge.safety.faults.row import Action
 
 _ROUTE_NEAR_NS = 600_000_000
 """Largest distance in time of a shortest path from the instant that it is used for, ns."""
@@ -53,6 +54,8 @@ class FaultSpan:
     detail: str
     begin_ns: int
     end_ns: int
+    stops: bool = False
+    """Whether it stops the robot until a new arming."""
 
 
 @dataclass(frozen=True)
@@ -79,9 +82,25 @@ class Flight:
         return self.ticks[0].now_ns
 
     @property
-    def end_ns(self) -> int:
+    def last_tick_ns(self) -> int:
         """Instant of the last tick."""
         return self.ticks[-1].now_ns
+
+    @property
+    def end_ns(self) -> int:
+        """Instant of the last tick or truth: an episode goes on without ticks after a stop until a new arming."""
+        return max(self.last_tick_ns, self.truths[-1].stamp_ns if self.truths else self.last_tick_ns)
+
+    @property
+    def stop_fault(self) -> FaultSpan | None:
+        """The first fault that stopped the robot until a new arming; None without one."""
+        return min((fault for fault in self.faults if fault.stops), key=lambda fault: fault.begin_ns, default=None)
+
+    @property
+    def result_faults(self) -> tuple[str, ...]:
+        """The result's lines on what ended or invalidated the run."""
+        lines = self.result.get("faults")
+        return tuple(map(str, lines)) if isinstance(lines, list) else ()
 
     def seconds(self, at_ns: int) -> float:
         """Return an instant as s since the first tick."""
@@ -149,12 +168,13 @@ def read_flight(path: Path) -> Flight:
 def _add_fault(faults: list[FaultSpan], stamp_ns: int, record: Mapping[str, Any]) -> None:
     name = str(record["name"])
     if record["change"] == "raised":
-        faults.append(FaultSpan(name, str(record["detail"]), stamp_ns, 2**63))
+        stops = record.get("action") == Action.STOP.name
+        faults.append(FaultSpan(name, str(record["detail"]), stamp_ns, 2**63, stops))
         return
     for index in range(len(faults) - 1, -1, -1):
         fault = faults[index]
         if fault.name == name and fault.end_ns == 2**63:
-            faults[index] = FaultSpan(name, fault.detail, fault.begin_ns, stamp_ns)
+            faults[index] = replace(fault, end_ns=stamp_ns)
             return
 
 

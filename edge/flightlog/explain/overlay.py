@@ -39,7 +39,10 @@ class Overlay:
         self._mount, self._width_px = mount, width_px
 
     def draw(self, jpeg: bytes, tick: RecordedTick | None, generation: RecordedGeneration | None) -> Picture | None:
-        """Return the picture, BGR, with the tick's plan and the generation's waypoints; None for a bad JPEG."""
+        """Return the picture, BGR, with the tick's plan and the generation's waypoints; None for a bad JPEG.
+
+        Without a tick, the picture is the generation's anchor: its waypoints are drawn as written, and no plan.
+        """
         image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR) if jpeg else None
         if image is None:
             return None
@@ -48,10 +51,10 @@ class Overlay:
             aspect = self._mount.aspect
         size = (self._width_px, 2 * round(self._width_px / aspect / 2))
         picture: Picture = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_LINEAR), np.uint8)
-        if self._mount is None or tick is None:
+        if self._mount is None:
             return picture
         floor = FloorProjector(self._mount.geometry, *size)
-        if tick.rows is not None and np.isfinite(tick.rows).all():
+        if tick is not None and tick.rows is not None and np.isfinite(tick.rows).all():
             self._draw_plan(picture, floor, tick.rows)
         if generation is not None:
             self._draw_waypoints(picture, floor, waypoints_seen(tick, generation))
@@ -90,9 +93,9 @@ class Overlay:
         return np.asarray(points[:, 0] > self._mount.geometry.forward_m + _NEAREST_M)
 
 
-def waypoints_seen(tick: RecordedTick, generation: RecordedGeneration) -> list[tuple[float, float]]:
-    """Return a generation's waypoints in the robot's frame at a tick, m."""
-    back = tick.offset.inverse()
+def waypoints_seen(tick: RecordedTick | None, generation: RecordedGeneration) -> list[tuple[float, float]]:
+    """Return a generation's waypoints in the robot's frame at a tick, m; None: at the generation's anchor."""
+    back = SE2(0.0, 0.0, 0.0) if tick is None else tick.offset.inverse()
     places = [back @ SE2(x_m, y_m, 0.0) for x_m, y_m in parse_waypoints(generation.text) or ()]
     return [(place.x_m, place.y_m) for place in places]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,35 +21,63 @@ _TILE_PX: Final = 400
 _TILE_TEXT_PX: Final = 44
 _COLUMNS: Final = 4
 
+PictureKey = int | tuple[int, int]
+"""Stamp, ns, of an event's picture; stamp and number of the generation of a text's picture."""
 
-def drawn_pictures(path: Path, flight: Flight, stamps_ns: set[int]) -> dict[int, Picture]:
-    """Return the pictures of these stamps, BGR, with plan and waypoints drawn. Raises RecordingError, OSError."""
-    overlay, found = Overlay(flight.mount, CARD_PX), {}
+
+def drawn_pictures(path: Path, flight: Flight, wanted: Set[PictureKey]) -> dict[PictureKey, Picture]:
+    """Return these pictures, BGR: an event's with plan and waypoints drawn, a text's with the text's waypoints.
+
+    Raises RecordingError, OSError.
+    """
+    overlay = Overlay(flight.mount, CARD_PX)
+    found: dict[PictureKey, Picture] = {}
+    keys: dict[int, list[PictureKey]] = {}
+    for key in wanted:
+        keys.setdefault(key if isinstance(key, int) else key[0], []).append(key)
     for event in read_events(path):
-        if isinstance(event, RecordedFrame) and event.stamp_ns in stamps_ns:
-            ticks = flight.ticks_between(event.stamp_ns, event.stamp_ns + 500_000_000)
-            tick = ticks[0] if ticks else None
-            drawn = overlay.draw(event.jpeg, tick, None if tick is None else generation_of(flight, tick))
+        if not isinstance(event, RecordedFrame):
+            continue
+        for key in keys.get(event.stamp_ns, ()):
+            drawn = _drawn(overlay, flight, event, key)
             if drawn is not None:
-                found[event.stamp_ns] = drawn
+                found[key] = drawn
     return found
 
 
-def wanted_stamps(found: Sequence[Explanation]) -> set[int]:
-    """Return the stamps of all pictures that the explanations show, ns."""
+def _drawn(overlay: Overlay, flight: Flight, frame: RecordedFrame, key: PictureKey) -> Picture | None:
+    if not isinstance(key, int):
+        # The tick at the anchor drove by an earlier text.
+        return overlay.draw(frame.jpeg, None, flight.generations.get(key[1]))
+    ticks = flight.ticks_between(frame.stamp_ns, frame.stamp_ns + 500_000_000)
+    tick = ticks[0] if ticks else None
+    return overlay.draw(frame.jpeg, tick, None if tick is None else generation_of(flight, tick))
+
+
+def wanted_stamps(found: Sequence[Explanation]) -> set[PictureKey]:
+    """Return the keys of all pictures that the explanations show."""
     return {
-        at for each in found if not each.refers for at in (each.anchor_frame_ns, each.event_frame_ns) if at is not None
+        key for each in found if not each.refers for key in (_text_key(each), each.event_frame_ns) if key is not None
     }
 
 
-def card(flight: Flight, each: Explanation, pictures: Mapping[int, Picture], *, decisive: bool) -> dict[str, Any]:
+def _text_key(each: Explanation) -> PictureKey | None:
+    if each.anchor_frame_ns is None or each.generation is None:
+        return None
+    return each.anchor_frame_ns, each.generation
+
+
+def card(
+    flight: Flight, each: Explanation, pictures: Mapping[PictureKey, Picture], *, decisive: bool
+) -> dict[str, Any]:
     """Return an explanation with its pictures as JPEG: the anchor's, which the text describes, and the event's."""
     shown: list[dict[str, Any]] = []
     if each.refers:
         return {**each.as_json(), "steps": [], "evidence": [], "pictures": shown, "decisive": decisive}
-    for name, at_ns in (("the text's picture", each.anchor_frame_ns), ("the event", each.event_frame_ns)):
-        if at_ns is not None and at_ns in pictures:
-            shown.append({"jpeg": jpeg(pictures[at_ns]), "caption": f"{name}, {flight.seconds(at_ns):.1f} s"})
+    for name, key in (("the text's picture", _text_key(each)), ("the event", each.event_frame_ns)):
+        if key is not None and key in pictures:
+            at_ns = key if isinstance(key, int) else key[0]
+            shown.append({"jpeg": jpeg(pictures[key]), "caption": f"{name}, {flight.seconds(at_ns):.1f} s"})
     return {**each.as_json(), "steps": list(each.steps), "pictures": shown, "decisive": decisive}
 
 

@@ -77,6 +77,8 @@ class Verdict:
 
 def judge(flight: Flight, event: Event) -> Verdict:
     """Return the verdict of an event. The end of a run is judged by its longest earlier event, see `decisive`."""
+    if event.final:
+        return _final_stop(flight)
     begin_ns, end_ns = window(event)
     ticks = flight.ticks_between(begin_ns, end_ns)
     if not ticks:
@@ -101,24 +103,32 @@ def judge(flight: Flight, event: Event) -> Verdict:
 
 
 def window(event: Event) -> tuple[int, int]:
-    """Return the span whose ticks decide an event, ns: before a contact or a detour, from the begin of a stop on."""
-    if event.kind == STOP:
+    """Return the span whose ticks decide an event, ns: from the begin of a stop on, before any other event.
+
+    The stop that only a new arming ends has no ticks after its begin.
+    """
+    if event.kind == STOP and not event.final:
         return event.begin_ns, min(event.end_ns, event.begin_ns + _BEFORE_NS)
     return event.begin_ns - _BEFORE_NS, event.begin_ns
 
 
 def decisive(flight: Flight, events: Sequence[Event]) -> Event | None:
-    """Return the event that cost the run its goal: the fall, else the stop or detour that took longest.
+    """Return the event that cost the run its goal.
 
+    The fall; else the stop that only a new arming ends; else the stop or detour that took longest; else the first
+    collision or the end itself. Of a run that reached its goal, the first collision.
     None without an event, and for a run of a robot, whose log does not say whether the goal was reached.
     """
     if not events or "end" not in flight.result:
         return None
-    if events[-1].kind == FALL or flight.result["end"] == "reached":
-        return next((event for event in events if event.kind in (FALL, COLLISION)), None)
+    collision = next((event for event in events if event.kind == COLLISION), None)
+    if flight.result["end"] == "reached":
+        return collision
+    if events[-1].kind == FALL:
+        return events[-1]
     costly = [event for event in events if event.kind in (STOP, DETOUR)]
-    longest = max(costly, key=lambda event: event.seconds, default=None)
-    return longest or next((event for event in events if event.kind == COLLISION), events[-1])
+    longest = max(costly, key=lambda event: (event.final, event.seconds), default=None)
+    return longest or collision or events[-1]
 
 
 def _odometry(flight: Flight, tick: RecordedTick) -> Verdict | None:
@@ -271,6 +281,16 @@ def _execution(flight: Flight, ticks: Sequence[RecordedTick]) -> Verdict | None:
     source = "true" if true else "by odometry"
     return Verdict(EXECUTION, f"the robot did not do as commanded: {blocked}",
                    (f"{asked_m:.2f} m commanded, {went_m:.2f} m driven ({source})",))  # fmt: skip
+
+
+def _final_stop(flight: Flight) -> Verdict:
+    """Name what stopped the robot until a new arming: the fault, or the first line of the result."""
+    fault, lines = flight.stop_fault, flight.result_faults
+    if fault is not None:
+        return Verdict(LIMITED, f"stopped until a new arming: {fault.name}", (fault.detail, *lines))
+    if lines:
+        return Verdict(LIMITED, lines[0], lines[1:])
+    return Verdict(LIMITED, "control ended before the episode did, and the log names no fault")
 
 
 def _of_stop(flight: Flight, event: Event, ticks: Sequence[RecordedTick]) -> Verdict:

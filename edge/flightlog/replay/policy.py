@@ -206,7 +206,7 @@ class Replayer:
         if self._encoded is None or self._encoded[0] != tick.frame_ns:
             picture = decode_frame(self._frames[tick.frame_ns], self._image_px)
             self._encoded = tick.frame_ns, self._policy.encode(picture)
-        trajectory = self._policy.act(self._encoded[1], tick.state, tick.delay_s, tick.offset, semantic)
+        trajectory = self._policy.act(self._encoded[1], tick.state, tick.delay_given_s, tick.offset, semantic)
         every = max(1, round(TARGET_TIME_S / self._step_s))
         rows = trajectory[every - 1 :: every].astype(np.float64)
         if rows.shape != tick.rows.shape:

@@ -76,7 +76,9 @@ class RecordedTick:
     frame_ns: int | None
     generation: int | None
     delay_s: float
-    """As the policy received it."""
+    """Δt, s."""
+    delay_given_s: float
+    """Δt as the policy received it, s: within its training range."""
     offset: SE2
     pose: SE2 | None
     state: tuple[float, float, float]
@@ -169,13 +171,16 @@ def _tick(payload: Mapping[str, Any]) -> RecordedTick:
     offset, pose, state, rows = (payload[key] for key in ("offset", "pose", "state", "trajectory"))
     driven = payload["generation"] is not None and offset is not None and state is not None
     now_ns = int(payload["now_ns"])
+    delay_s = float(payload["delay_s"]) if driven else math.nan
     return RecordedTick(
         number=int(payload["tick"]),
         now_ns=now_ns,
         acted_ns=now_ns + round(float(payload["act_ms"] or 0.0) * 1e6),
         frame_ns=None if payload["frame_ns"] is None else int(payload["frame_ns"]),
         generation=int(payload["generation"]) if driven else None,
-        delay_s=float(payload.get("delay_given_s", payload["delay_s"])) if driven else math.nan,
+        delay_s=delay_s,
+        # A log from before Δt was clamped: the policy received it as it was.
+        delay_given_s=float(payload.get("delay_given_s", delay_s)) if driven else math.nan,
         offset=_pose(offset) if driven else SE2(0.0, 0.0, 0.0),
         pose=None if pose is None else _pose(pose),
         state=_triple(state) if driven else (0.0, 0.0, 0.0),

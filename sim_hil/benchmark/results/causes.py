@@ -22,6 +22,8 @@ from sim_hil.benchmark.results.store import CAUSES
 from sim_hil.benchmark.results.summary import group_names, grouped_by
 
 UNEXPLAINED: Final = "unexplained"
+RULE_ERRORS: Final = (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, AssertionError)
+"""Errors of a rule on values that it does not expect. They must not lose the episode: only failed ones come here."""
 
 
 def general_reason(decisive: Explanation) -> str:
@@ -31,19 +33,27 @@ def general_reason(decisive: Explanation) -> str:
 
 
 def keep_cause(flight: Path, folder: Path) -> None:
-    """Explain a flight log, write its cause into the run's `folder`, and delete the log. Raises OSError."""
+    """Explain a flight log, write its cause into the run's `folder`, and delete the log. Raises OSError.
+
+    A log on which the rules fail is unexplained and kept beside its cause.
+    """
+    content, failed = {"cause": UNEXPLAINED, "because": ""}, False
     try:
         found = read_flight(flight)
         decisive = deciding(found, explain(found))
+        if decisive is not None:
+            content = {"cause": decisive.verdict.cause, "because": general_reason(decisive)}
     except RecordingError:
-        decisive = None
-    content = {"cause": UNEXPLAINED, "because": ""}
-    if decisive is not None:
-        content = {"cause": decisive.verdict.cause, "because": general_reason(decisive)}
+        pass  # a damaged log, which no later version explains either
+    except RULE_ERRORS as error:
+        content["because"], failed = f"the rules failed on its log ({type(error).__name__})", True
     path = folder / CAUSES / f"{flight.stem}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, json.dumps(content) + "\n")
-    flight.unlink()
+    if failed:
+        flight.replace(path.with_suffix(flight.suffix))
+    else:
+        flight.unlink()
 
 
 def read_causes(directory: Path, results: Sequence[EpisodeResult]) -> dict[str, tuple[str, str]]:

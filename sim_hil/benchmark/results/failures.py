@@ -16,7 +16,7 @@ from edge.flightlog.explain.overlay import Picture
 from edge.flightlog.explain.pictures import card, contact_sheet, drawn_pictures, wanted_stamps
 from edge.flightlog.reader import RecordingError
 from reporting.page import Table
-from sim_hil.benchmark.results.causes import general_reason
+from sim_hil.benchmark.results.causes import RULE_ERRORS, general_reason
 from sim_hil.benchmark.results.record import EpisodeResult
 from sim_hil.benchmark.results.store import FLIGHTS
 
@@ -40,7 +40,7 @@ def failures(directory: Path, results: Sequence[EpisodeResult]) -> list[Failure]
             continue
         try:
             failure = _failure(path, result)
-        except (RecordingError, OSError):
+        except (RecordingError, OSError, *RULE_ERRORS):  # one log does not lose the report of the others
             continue
         if failure is not None:
             found.append(failure)

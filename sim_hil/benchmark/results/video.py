@@ -227,7 +227,7 @@ def _state_line(notes: Mapping[str, object]) -> str:
         return str(notes["says"])[:110]
     parts = []
     if notes.get("thinking_s") is not None:
-        parts.append(f"thinking for {notes['thinking_s']:.1f} s")
+        parts.append(f"reasoning for {notes['thinking_s']:.1f} s")
     if notes.get("reason") not in (None, "ok"):
         parts.append(f"stands: {notes['reason']}")
     if notes.get("generation") is not None:

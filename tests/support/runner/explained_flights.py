@@ -45,6 +45,7 @@ def tick(second: float, **changes: Any) -> RecordedTick:
         frame_ns=at(second),
         generation=generation,
         delay_s=age_s,
+        delay_given_s=age_s,
         offset=SE2(SPEED_MPS * age_s, 0.0, 0.0),
         pose=SE2(SPEED_MPS * second, 0.0, 0.0),
         state=(SPEED_MPS, 0.0, 0.0),

@@ -202,7 +202,7 @@ def test_without_truth_a_flight_knows_stops_and_loops_but_no_contacts() -> None:
 
 def test_a_timeout_is_explained_by_the_event_that_took_longest() -> None:
     flight = flights.flight(
-        ticks=lambda s: stopped(s, command=(0.0, 0.0, 0.0), reason="thinking"), truths=standing_truth,
+        ticks=lambda s: stopped(s, command=(0.0, 0.0, 0.0), reason="reasoning"), truths=standing_truth,
         result={"end": "timeout", "ne_m": 9.0},
     )  # fmt: skip
     found = explain(flight)

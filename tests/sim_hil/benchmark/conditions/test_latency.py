@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.flightlog.recorder import Recorder
+from edge.inference import latency_profile
 from sim_hil.benchmark.conditions.latency import (
     LatencyError,
     LatencyProfile,
@@ -137,6 +138,15 @@ def test_a_profile_may_be_toml(tmp_path: Path) -> None:
     assert load_profile(path).generation_s == (1.0, 2.0)
 
 
+@pytest.mark.parametrize("suffix", ["json", "toml"])
+def test_a_time_of_hundreds_of_digits_is_refused(tmp_path: Path, suffix: str) -> None:
+    path, content = tmp_path / f"profile.{suffix}", profile(generation_s=[10**400])
+    lines = [f"{key} = {json.dumps(value)}\n" for key, value in content.items()]
+    path.write_text(json.dumps(content) if suffix == "json" else "".join(lines))
+    with pytest.raises(LatencyError):
+        load_profile(path)
+
+
 @pytest.mark.parametrize("argument", ["soon", "-1", "nan", "inf", "61", "profile:", "profile:nowhere.json"])
 def test_an_invalid_latency_is_refused(argument: str) -> None:
     with pytest.raises(LatencyError):
@@ -152,6 +162,15 @@ def test_a_flight_log_gives_each_generations_time_and_anchor(tmp_path: Path) -> 
     read = load_profile(tmp_path / "flight.mcap")
     # The second one's newest frame is older than its start: its delay at release is kept, 2.1 s.
     assert read.generation_s == pytest.approx((3.0, 2.1)) and read.anchor_after_s == pytest.approx((0.5, 0.0))
+
+
+def test_a_flight_log_with_a_stamp_of_hundreds_of_digits_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record = {"started_ns": 0, "anchor_ns": 0, "ready_ns": 10**400}
+    monkeypatch.setattr(latency_profile, "read_messages", lambda _: iter([("/semantic", 0, record)]))
+    with pytest.raises(LatencyError, match="misshapes a field"):
+        load_profile(tmp_path / "flight.mcap")
 
 
 def test_an_edge_run_result_gives_a_distribution_through_its_percentiles(tmp_path: Path) -> None:

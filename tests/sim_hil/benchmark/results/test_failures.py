@@ -13,6 +13,7 @@ from edge.core.geometry import SE2
 from edge.flightlog.explain.flight import read_flight
 from edge.flightlog.standard_messages import jpeg_size
 from sim_hil.benchmark.env.metrics import Outcome
+from sim_hil.benchmark.results import causes as causes_of
 from sim_hil.benchmark.results.causes import cause_counts, cause_tables, keep_cause, read_causes
 from sim_hil.benchmark.results.failures import cause_table, counts, failure_sheet, failures
 from sim_hil.benchmark.results.flight import EpisodeFlight
@@ -109,6 +110,24 @@ def test_a_log_that_cannot_be_read_is_an_unexplained_failure(run: Path, tmp_path
     log.write_bytes((run / "flights" / "a.mcap").read_bytes()[:100])
     keep_cause(log, tmp_path)
     assert read_causes(tmp_path, RESULTS) == {"a": ("unexplained", "")}
+
+
+@pytest.mark.parametrize("error", [KeyError("frames"), ZeroDivisionError(), TypeError(), ValueError()], ids=repr)
+def test_a_log_on_which_the_rules_fail_is_an_unexplained_failure_and_kept(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def fail(_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(causes_of, "explain", fail)
+    (tmp_path / "flights").mkdir()
+    log = tmp_path / "flights" / "a.mcap"
+    log.write_bytes((run / "flights" / "a.mcap").read_bytes())
+    keep_cause(log, tmp_path)
+    because = f"the rules failed on its log ({type(error).__name__})"
+    assert read_causes(tmp_path, RESULTS) == {"a": ("unexplained", because)}
+    assert sorted(path.name for path in (tmp_path / "causes").iterdir()) == ["a.json", "a.mcap"]
+    assert failures(tmp_path, RESULTS) == [], "the report does not read it"
 
 
 def test_causes_are_counted_in_the_groups_of_the_rates() -> None:
