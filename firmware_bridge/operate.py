@@ -36,36 +36,44 @@ class Unconfirmed:
 
 Answer = BridgeStatus | BridgeUnavailable | Unconfirmed
 """Result of one socket: the confirming status, the reason for no bridge, or a missing confirmation."""
+Say = Callable[[str], None]
+"""Takes a line for the operator; any thread may call it."""
 
 
-def operate(command: str, *sockets: Path) -> tuple[int, dict[str, object]]:
-    """Send `command` to every bridge that listens at one of `sockets`; report their states on stderr.
+def _write(text: str) -> None:
+    """Write one line of `edge-bridge` to stderr."""
+    sys.stderr.write(f"edge-bridge: {text}\n")
+    sys.stderr.flush()
+
+
+def operate(command: str, *sockets: Path, say: Say = _write) -> tuple[int, dict[str, object]]:
+    """Send `command` to every bridge that listens at one of `sockets`; report their states to `say`, line by line.
 
     Returns the exit code (0 done, 1 not confirmed by all in time, 3 refused or no bridge) and a status as JSON values.
     `arm` needs a single bridge: where several answer, the operator has to choose one.
     """
-    answers = _at_each("status" if command == "arm" else command, *sockets)
+    answers = _at_each("status" if command == "arm" else command, say, *sockets)
     reached = [socket for socket, answer in answers.items() if not isinstance(answer, BridgeUnavailable)]
     if command == "arm" and len(reached) > 1:
-        return _refuse(f"bridges answer at {' and '.join(map(str, reached))}; choose one with --socket")
+        return _refuse(say, f"bridges answer at {' and '.join(map(str, reached))}; choose one with --socket")
     if command == "arm":
-        answers |= _at_each(command, *reached)
+        answers |= _at_each(command, say, *reached)
     missing = [answer for answer in answers.values() if isinstance(answer, BridgeUnavailable)]
     hidden = [answer for answer in missing if _is_hidden(answer)]
     unconfirmed = [answer for answer in answers.values() if isinstance(answer, Unconfirmed)]
     statuses = [answer for answer in answers.values() if isinstance(answer, BridgeStatus)]
     if len(missing) == len(answers):
         advice = f"; the robot was NOT stopped: {_USE_REMOTE}" if command == "stop" and hidden else ""
-        return _refuse("; ".join(map(str, hidden or missing)) + advice)
+        return _refuse(say, "; ".join(map(str, hidden or missing)) + advice)
     for status in (*statuses, *(answer.status for answer in unconfirmed if answer.status is not None)):
         blocked = "" if status.blocked_by == "none" else f"; arming is refused: {status.blocked_by}"
-        sys.stderr.write(f"edge-bridge: {status.state}: {status.reason}{blocked}\n")
+        say(f"{status.state}: {status.reason}{blocked}")
     if command == "arm" and any(status.permit == "not needed" for status in statuses):
-        sys.stderr.write("edge-bridge: no permission is needed: the runner arms by itself\n")
+        say("no permission is needed: the runner arms by itself")
     for error in hidden:
-        sys.stderr.write(f"edge-bridge: {one_line(error)}\n")
+        say(one_line(error))
     for answer in unconfirmed:
-        sys.stderr.write(f"edge-bridge: {_why_unconfirmed(command, answer.status)}\n")
+        say(_why_unconfirmed(command, answer.status))
     values = statuses[0] if statuses else next((answer.status for answer in unconfirmed if answer.status), None)
     result: dict[str, object] = {"error": "not confirmed"} if values is None else asdict(values)
     if command == "arm" and unconfirmed and unconfirmed[0].status is not None:
@@ -83,8 +91,8 @@ def _why_unconfirmed(command: str, status: BridgeStatus | None) -> str:
     return f"{command} was not confirmed within {CONFIRM_S:g} s"
 
 
-def _refuse(why: str) -> tuple[int, dict[str, object]]:
-    sys.stderr.write(f"edge-bridge: {one_line(why)}\n")
+def _refuse(say: Say, why: str) -> tuple[int, dict[str, object]]:
+    say(one_line(why))
     return 3, {"error": why}
 
 
@@ -93,23 +101,23 @@ def _is_hidden(error: BridgeUnavailable) -> bool:
     return not isinstance(error.__cause__, (FileNotFoundError, ConnectionRefusedError))
 
 
-def _at_each(command: str, *sockets: Path) -> dict[Path, Answer]:
+def _at_each(command: str, say: Say, *sockets: Path) -> dict[Path, Answer]:
     """Send to all sockets at the same time: a bridge that hangs must not delay another one's stop."""
     if not sockets:
         return {}
     different = list(dict.fromkeys(sockets))
     with ThreadPoolExecutor(len(different)) as pool:
-        return dict(zip(different, pool.map(functools.partial(_operate, command), different), strict=True))
+        return dict(zip(different, pool.map(functools.partial(_operate, command, say), different), strict=True))
 
 
-def _operate(command: str, socket: Path) -> Answer:
+def _operate(command: str, say: Say, socket: Path) -> Answer:
     """Connect and send; a stop is repeated until CONFIRM_S has passed, whatever ends a connection."""
     deadline_ns = time.monotonic_ns() + round(CONFIRM_S * 1e9)
     while True:
         try:
             client = BridgeClient(f"{socket}{OPERATOR_SUFFIX}")
             try:
-                return _stop(client) if command == "stop" else _ask(command, client)
+                return _stop(client, say) if command == "stop" else _ask(command, client)
             finally:
                 client.close()
         except BridgeUnavailable as error:
@@ -119,7 +127,7 @@ def _operate(command: str, socket: Path) -> Answer:
             time.sleep(_POLL_S)
 
 
-def _stop(client: BridgeClient) -> BridgeStatus | Unconfirmed:
+def _stop(client: BridgeClient, say: Say) -> BridgeStatus | Unconfirmed:
     """Stop, and poll until the robot reports standstill; warn as soon as it does not obey."""
     asked_ns = time.monotonic_ns()
     latched = _follow(client, asked_ns, CONFIRM_S, _is_latched, again=client.stop)
@@ -129,8 +137,7 @@ def _stop(client: BridgeClient) -> BridgeStatus | Unconfirmed:
     if isinstance(answer, Unconfirmed):
         moves = answer.status is not None and answer.status.motion == "moving"
         state = "the robot still moves" if moves else "no report that the robot stands still yet"
-        sys.stderr.write(f"edge-bridge: stop sent; {state}: be ready to {_USE_REMOTE}\n")
-        sys.stderr.flush()
+        say(f"stop sent; {state}: be ready to {_USE_REMOTE}")
         answer = _follow(client, asked_ns, _STAND_S, lambda status: _is_latched(status) and status.motion == "still")
     return answer
 

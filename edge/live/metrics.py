@@ -39,7 +39,7 @@ class Metrics:
         )
         self._tokens = Counter("tic_vla_generated_tokens", "Tokens of the reasoning text.", registry=self._registry)
         self._faults = Counter("tic_vla_faults", "Faults raised.", ("name", "action"), registry=self._registry)
-        self._dropped = gauge("view_dropped_records", "Records that the view's process could not take.")
+        self._dropped = gauge("view_dropped_records", "Records that the view did not receive or could not read.")
         self._ticks = gauge("ticks", "Number of ticks of the control thread.")
         self._delay = gauge("delay_seconds", "Delay from the anchor's frame to now.")
         self._frame_age = gauge("frame_age_seconds", "Age of the frame that the policy saw.")
@@ -87,7 +87,7 @@ class Metrics:
                 self._yaw.labels(kind).set(values[2])
 
     def text(self, dropped: int) -> bytes:
-        """Return the metrics as text; `dropped`: records that the view could not take."""
+        """Return the metrics as text; `dropped`: records that the view did not receive or could not read."""
         self._dropped.set(dropped)
         return bytes(generate_latest(self._registry))  # type: ignore[no-untyped-call]
 

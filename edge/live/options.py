@@ -8,6 +8,7 @@ import importlib.util
 import os
 import re
 import secrets
+import socket
 import stat
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,11 @@ DEFAULT_PORT: Final = 8765
 _TOKEN_BYTES: Final = 16
 _TOKEN: Final = re.compile(r"[A-Za-z0-9_-]{22,128}")
 _OTHERS: Final = 0o077
+_EVERY: Final = {
+    "0.0.0.0": (LOOPBACK, socket.AF_INET, "192.0.2.1"),
+    "::": ("::1", socket.AF_INET6, "2001:db8::1"),  # IPv6 alone: asyncio listens there with IPV6_V6ONLY
+}
+"""Addresses that mean every interface: their loopback, family, and an address elsewhere (RFC 5737, RFC 3849)."""
 
 
 class LiveError(OSError):
@@ -52,8 +58,29 @@ class LiveOptions:
 
     def url(self, port: int, token: str) -> str:
         """Return the page's address for a browser of this machine."""
-        shown = LOOPBACK if self.address in ("0.0.0.0", "::") else self.address
-        return f"http://{shown}:{port}/?token={token}"
+        shown = _EVERY[self.address][0] if self.address in _EVERY else self.address
+        return _url(shown, port, token)
+
+    def url_elsewhere(self, port: int, token: str) -> str | None:
+        """Return the page's address for other computers where every interface listens, else None."""
+        if self.address not in _EVERY:
+            return None
+        _, family, elsewhere = _EVERY[self.address]
+        return _url(_own_address(family, elsewhere), port, token)
+
+
+def _url(host: str, port: int, token: str) -> str:
+    return f"http://{f'[{host}]' if ':' in host else host}:{port}/?token={token}"
+
+
+def _own_address(family: socket.AddressFamily, elsewhere: str) -> str:
+    """Return this machine's address on the way to `elsewhere`; its name where no network leads there."""
+    try:
+        with socket.socket(family, socket.SOCK_DGRAM) as probe:
+            probe.connect((elsewhere, 9))  # chooses the interface; a datagram socket sends nothing yet
+            return str(probe.getsockname()[0])
+    except OSError:
+        return socket.gethostname()
 
 
 def kept_token(path: Path) -> str:

@@ -1,7 +1,8 @@
 """The process of the live view: a web page, Foxglove's protocol and metrics, for clients that know the run's token.
 
-`edge-run --live` starts it; it ends with the runner. Every client has a queue of its own in which newer messages
-replace older ones, so a slow client costs itself pictures and nobody else anything.
+`edge-run --live` starts it; it ends soon after the runner, once it has answered the stops under way. Every client has a
+queue of its own in which newer messages replace older ones, so a slow client costs itself pictures and nobody else
+anything.
 """
 
 from __future__ import annotations
@@ -14,9 +15,11 @@ import json
 import os
 import resource
 import secrets
+import select
 import signal
 import socket
 import sys
+import threading
 from collections import deque
 from collections.abc import AsyncIterator, Sequence
 from importlib.resources import files
@@ -32,16 +35,19 @@ from edge.flightlog.standard_schemas import COMPRESSED_IMAGE, STANDARD_SCHEMAS, 
 from edge.live import wire
 from edge.live.foxglove import MOST_REQUEST_BYTES, SUBPROTOCOLS, Channels, ProtocolError, Subscriptions, server_info
 from edge.live.metrics import CONTENT_TYPE, Metrics
+from edge.live.stop import RobotStop
 from edge.live.view import LiveState, Message
-from firmware_bridge.operate import operate
 
 FOXGLOVE_ORIGINS: Final = ("https://app.foxglove.dev",)
 MOST_CLIENTS: Final = 16
-STOP_ANSWER_S: Final = 3.0
+END_S: Final = 6
+"""Time by which this process outlives its runner at most, s: 4 s for stops, 1.5 s for what clients have not read."""
 EACH_COUNTS: Final = frozenset({*wire.EVENTS, "/log", "/scene"})
 """Topics of which a client gets every message, up to _MOST_WAITING; of all others only the newest."""
 
 _SCHEMA_OF: Final = {**STANDARD_SCHEMAS, **SCHEMAS}
+_LAST_MESSAGES_S: Final = 0.5
+"""Time to send what waits when the runner has ended, s; the connections have as much again to end."""
 _MOST_WAITING: Final = 64
 _MOST_FILES: Final = 128  # also the most connections: a flood fills them, not the memory
 _NICENESS: Final = 10
@@ -72,32 +78,40 @@ class Client:
             self._newest[topic] = data
         self._ready.set()
 
+    async def finish(self) -> None:
+        """Wait until everything is sent, then close the connection."""
+        while self._ready.is_set():
+            await asyncio.sleep(0.01)
+        await self.socket.close(code=WSCloseCode.GOING_AWAY)
+
     async def send_all(self) -> None:
         """Send what waits, for ever."""
         while True:
             await self._ready.wait()
-            self._ready.clear()
             while self._each or self._newest:
                 data = self._each.popleft() if self._each else self._newest.pop(next(iter(self._newest)))
                 if isinstance(data, bytes):
                     await self.socket.send_bytes(data)
                 else:
                     await self.socket.send_str(data)
+            self._ready.clear()  # after the last message is sent: `finish` waits for it
 
 
 class LiveServer:
     """Serves one run. `runner`: the socket to it."""
 
     def __init__(self, config: wire.ViewConfig, runner: socket.socket) -> None:
-        self._config, self._runner = config, runner
+        self._config = config
+        self._stop = None if config.bridge is None else RobotStop(config.bridge, runner)
         self._state, self._metrics, self._standard = LiveState(), Metrics(), StandardMessages()
         self._channels = Channels()
-        self._latest: dict[str, tuple[int, bytes]] = {}  # the newest of every Foxglove channel
+        # The newest of every Foxglove channel; of a scene the newest of every entity, whose few names are our own.
+        self._latest: dict[tuple[str, str], tuple[int, bytes]] = {}
         self._pages: set[Client] = set()
         self._viewers: set[Client] = set()
         self._session = secrets.token_hex(4)
-        self._stop_answer: asyncio.Future[bool] | None = None
         self._malformed = 0
+        self._dropped = 0  # by the runner
 
     def app(self) -> web.Application:
         """Return the web application."""
@@ -109,17 +123,18 @@ class LiveServer:
                 web.get("/foxglove", self._foxglove),
                 web.get("/layout.json", self._layout),
                 web.get("/metrics", self._show_metrics),
-                web.post("/stop", self._stop),
+                web.post("/stop", self._stop_robot),
             ]
         )
         return app
 
     # From the runner
 
-    def take(self, datagram: wire.Datagram) -> None:
+    def take(self, data: bytes) -> None:
         """Pass one datagram of the runner on to the clients; one that cannot be read is counted."""
-        topic, stamp_ns = datagram.topic, datagram.stamp_ns
         try:
+            datagram = wire.decode(data)
+            topic, stamp_ns = datagram.topic, datagram.stamp_ns
             if datagram.kind == wire.PICTURE:
                 self._show(self._state.picture(topic, stamp_ns, datagram.payload))
                 self._offer_standard(topic, stamp_ns, datagram.payload)
@@ -131,10 +146,20 @@ class LiveServer:
                 self._show(self._state.record(topic, stamp_ns, record))
                 self._offer(topic, stamp_ns, datagram.payload, _SCHEMA_OF.get(topic, ANY_OBJECT))
                 self._offer_standard(topic, stamp_ns, record)
-            elif datagram.kind == wire.STOPPED and self._stop_answer is not None and not self._stop_answer.done():
-                self._stop_answer.set_result(json.loads(datagram.payload).get("confirmed") is True)
+            elif datagram.kind == wire.STOPPED and self._stop is not None:
+                self._stop.answered(json.loads(datagram.payload).get("confirmed") is True)
+            elif datagram.kind == wire.DROPPED:
+                self._dropped = int(datagram.payload)
         except (ValueError, TypeError, KeyError, AttributeError):
             self._malformed += 1
+
+    async def finish(self) -> None:
+        """Answer the stops under way and send what waits, each within its limit; the runner has ended."""
+        if self._stop is not None:
+            await self._stop.finish()
+        ending = [asyncio.create_task(client.finish()) for client in (*self._pages, *self._viewers)]
+        if ending:
+            await asyncio.wait(ending, timeout=_LAST_MESSAGES_S)
 
     def _show(self, messages: Sequence[Message]) -> None:
         for message in messages:
@@ -145,9 +170,10 @@ class LiveServer:
         assert isinstance(record, (dict, bytes))
         for message in self._standard.of(topic, stamp_ns, record):
             data = encode(message.payload, message.stamp_ns)
-            self._offer(message.topic, message.stamp_ns, data, STANDARD_SCHEMAS[message.topic])
+            entity = "".join(each["id"] for each in message.payload.get("entities", ()))
+            self._offer(message.topic, message.stamp_ns, data, STANDARD_SCHEMAS[message.topic], entity)
 
-    def _offer(self, topic: str, stamp_ns: int, data: bytes, schema: Schema) -> None:
+    def _offer(self, topic: str, stamp_ns: int, data: bytes, schema: Schema, entity: str = "") -> None:
         channel = self._channels.id_of(topic)
         if channel is None:
             advertisement = self._channels.add(topic, schema)
@@ -155,7 +181,7 @@ class LiveServer:
             for client in self._viewers:
                 client.offer(f"advertise {topic}", advertisement)
         assert channel is not None
-        self._latest[topic] = (stamp_ns, data)
+        self._latest[topic, entity] = (stamp_ns, data)
         for client in self._viewers:
             frame = client.subscriptions.frame(channel, stamp_ns, data)
             if frame is not None:
@@ -197,15 +223,17 @@ class LiveServer:
 
     async def _show_metrics(self, request: web.Request) -> web.Response:
         self._check(request)
-        return web.Response(body=self._metrics.text(self._malformed), headers={"Content-Type": CONTENT_TYPE})
+        return web.Response(
+            body=self._metrics.text(self._malformed + self._dropped), headers={"Content-Type": CONTENT_TYPE}
+        )
 
     async def _view(self, request: web.Request) -> web.WebSocketResponse:
         self._check(request)
         channel = web.WebSocketResponse(heartbeat=_HEARTBEAT_S, max_msg_size=1024, compress=False)
         client = Client(channel)
-        for message in self._state.snapshot():
-            client.offer(message.topic, _page_data(message))
         async with self._connected(request, client, self._pages):
+            for message in self._state.snapshot():  # now, so that no message between it and the next one is lost
+                client.offer(message.topic, _page_data(message))
             async for received in channel:
                 if received.type in (WSMsgType.TEXT, WSMsgType.BINARY):
                     await channel.close(code=WSCloseCode.POLICY_VIOLATION)  # the page sends nothing
@@ -231,7 +259,7 @@ class LiveServer:
 
     def _send_latest(self, client: Client, channels: Sequence[int]) -> None:
         """A new subscriber gets the newest message of each channel, also of those that come once."""
-        for topic, (stamp_ns, data) in self._latest.items():
+        for (topic, _), (stamp_ns, data) in self._latest.items():
             channel = self._channels.id_of(topic)
             frame = None if channel is None else client.subscriptions.frame(channel, stamp_ns, data)
             if channel in channels and frame is not None:
@@ -252,37 +280,13 @@ class LiveServer:
             with contextlib.suppress(asyncio.CancelledError, ConnectionError, RuntimeError):
                 await sending
 
-    # The STOP button
-
-    async def _stop(self, request: web.Request) -> web.Response:
-        """Stop the robot: as an operator if this user is one, else through the runner."""
+    async def _stop_robot(self, request: web.Request) -> web.Response:
         self._check(request)
         if not request.headers.get("Authorization"):
             raise web.HTTPForbidden(text="a stop needs the token in the header Authorization\n")
-        if self._config.bridge is None:
+        if self._stop is None:
             raise web.HTTPConflict(text="this view stops nothing: use the runner's view, or edge-bridge stop\n")
-        code, _ = await asyncio.get_running_loop().run_in_executor(None, operate, "stop", self._config.bridge)
-        if code == 0:
-            text = "stopped: the robot reports that it stands. Before it moves again: edge-bridge arm"
-            return web.json_response({"stopped": True, "latched": True, "text": text})
-        if await self._stop_by_runner():
-            text = "stopped by the runner, whose bridge confirms it. No operator's stop was possible: a new run can arm"
-            return web.json_response({"stopped": True, "latched": False, "text": text})
-        text = "NOT CONFIRMED: use the robot's remote, or switch the robot off"
-        return web.json_response({"stopped": False, "latched": False, "text": text})
-
-    async def _stop_by_runner(self) -> bool:
-        loop = asyncio.get_running_loop()
-        if self._stop_answer is None or self._stop_answer.done():
-            self._stop_answer = loop.create_future()
-            try:
-                self._runner.send(wire.Datagram(wire.STOP).encode())
-            except OSError:
-                return False
-        try:
-            return await asyncio.wait_for(asyncio.shield(self._stop_answer), STOP_ANSWER_S)
-        except asyncio.TimeoutError:
-            return False
+        return web.json_response(await self._stop.stop())
 
 
 def _page_data(message: Message) -> str | bytes:
@@ -293,12 +297,12 @@ def _page_data(message: Message) -> str | bytes:
 
 
 async def serve(runner: socket.socket) -> None:
-    """Listen as the runner configures, until the runner's end closes the socket."""
+    """Listen as the runner configures, until the runner's end closes the socket; then finish what is under way."""
     loop = asyncio.get_running_loop()
     runner.setblocking(False)
     config = wire.ViewConfig.parse(wire.decode(await loop.sock_recv(runner, wire.MOST_BYTES)).payload)
     server = LiveServer(config, runner)
-    serving = web.AppRunner(server.app(), access_log=None, keepalive_timeout=15.0)
+    serving = web.AppRunner(server.app(), access_log=None, keepalive_timeout=15.0, shutdown_timeout=_LAST_MESSAGES_S)
     await serving.setup()
     try:
         site = web.TCPSite(serving, config.address, config.port, backlog=MOST_CLIENTS)
@@ -312,9 +316,28 @@ async def serve(runner: socket.socket) -> None:
     freeze_garbage()
     port = serving.addresses[0][1]
     runner.send(wire.Datagram(wire.LISTENING, str(port).encode()).encode())
-    while data := await loop.sock_recv(runner, wire.MOST_BYTES):
-        with contextlib.suppress(wire.WireError):
-            server.take(wire.decode(data))
+    while data := await _received(runner):
+        server.take(data)
+    await site.stop()  # at once: the next run may listen at this port
+    await server.finish()
+    await serving.cleanup()
+
+
+async def _received(runner: socket.socket) -> bytes:
+    """Return the next datagram; empty after the runner's end."""
+    while True:
+        try:
+            return await asyncio.get_running_loop().sock_recv(runner, wire.MOST_BYTES)
+        except ConnectionResetError:
+            continue  # comes once, from a runner that has ended with a request unread: what it sent is still there
+
+
+def _limit_life(runner: socket.socket) -> None:
+    """End this process END_S after the runner, whatever hangs in it."""
+    ended = select.poll()
+    ended.register(runner, 0)  # for POLLHUP, which needs no asking
+    ended.poll()
+    signal.alarm(END_S)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -327,6 +350,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     keep_large_blocks_apart()
     resource.setrlimit(resource.RLIMIT_NOFILE, (_MOST_FILES, _MOST_FILES))
     with contextlib.suppress(OSError), socket.socket(fileno=args.fd) as runner:
+        threading.Thread(target=_limit_life, args=(runner,), name="end", daemon=True).start()
         asyncio.run(serve(runner))
     return 0
 

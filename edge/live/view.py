@@ -1,4 +1,4 @@
-"""What the live view knows of a run, and the messages that it makes of it. Pure: no socket, no clock."""
+"""Builds the live view's messages from a run's newest records. Pure: no socket, no clock."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from edge.safety.faults.table import FAULTS
 
 OVERLAY: Final = "/overlay"
 _KEPT: Final = 24
-_NEAREST_M: Final = 0.35
-"""Points of the floor nearer than this lie below the picture, or behind the camera."""
+_NEAREST_M: Final = 0.15
+"""Distance before the lens from which on the floor is drawn, m: nearer points lie below the picture or behind it."""
 _STEP_M: Final = 0.1
 
 
@@ -68,8 +68,9 @@ class LiveState:
                 fault = FAULTS[record["name"]]
                 found |= {"message": fault.message, "advice": fault.advice}
             elif topic == "/tick":
+                overlay = {"plan": [], "waypoints": []}  # replaces the earlier plan where this one cannot be drawn
                 overlay = self._overlay(record)
-        except (KeyError, TypeError, ValueError, AttributeError):
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
             pass  # a malformed record is shown as it is
         messages = [self._keep(Message(topic, stamp_ns, text_of(topic, stamp_ns, found)))]
         if overlay is not None:
@@ -110,7 +111,8 @@ class LiveState:
     def _pixels(
         self, seen: FloorProjector, points: list[tuple[float, float]], scale: tuple[float, float]
     ) -> list[list[float]]:
-        ahead = [(x, y) for x, y in points if x > _NEAREST_M and math.isfinite(x + y)]
+        nearest_m = seen.geometry.forward_m + _NEAREST_M
+        ahead = [(x, y) for x, y in points if x > nearest_m and math.isfinite(x + y)]
         if not ahead:
             return []
         pixels = seen.pixels(np.array(ahead, float), self._attitude) * np.array(scale)

@@ -11,9 +11,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-RECORD, PICTURE, CONFIG, STOPPED, LISTENING, STOP, REFUSED = 1, 2, 3, 4, 5, 6, 7
-"""Kinds. From the runner: a record as JSON, a JPEG, the configuration, the answer to a stop. From the view: the port
-at which it listens, a request to stop, why it cannot listen."""
+RECORD, PICTURE, CONFIG, STOPPED, LISTENING, STOP, REFUSED, DROPPED = 1, 2, 3, 4, 5, 6, 7, 8
+"""Kinds. From the runner: a record as JSON, a JPEG, the configuration, the answer to a stop, the number of records that
+it could not send. From the view: the port at which it listens, a request to stop, why it cannot listen."""
 EVENTS: Final = ("/run", "/semantic", "/fault", "/result")
 """Topics of which every record counts; of all others, only the newest."""
 MOST_BYTES: Final = 1 << 20
@@ -48,7 +48,7 @@ def decode(data: bytes) -> Datagram:
         topic = data[_HEADER.size : _HEADER.size + length].decode()
     except (struct.error, UnicodeDecodeError) as error:
         raise WireError(f"no datagram of the live view: {error}") from error
-    if len(data) < _HEADER.size + length or not RECORD <= kind <= REFUSED:
+    if len(data) < _HEADER.size + length or not RECORD <= kind <= DROPPED:
         raise WireError(f"no datagram of the live view: kind {kind}, {len(data)} bytes")
     return Datagram(kind, data[_HEADER.size + length :], topic, stamp_ns)
 

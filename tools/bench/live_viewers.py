@@ -1,12 +1,14 @@
 """Viewers of a live view for `tools.bench.live_cost`: `python -m tools.bench.live_viewers URL "five viewers"`.
 
-Pages and Foxglove read everything at once; one client reads nothing, one reads 1 kB/s. Ends at SIGINT.
+Pages and Foxglove read everything at once; one client reads nothing, one reads 1 kB/s. Ends at SIGINT. Prints how many
+messages pages and Foxglove have received as a line of JSON every 5 s: `{"received": {VIEWER: NUMBER}, "failure": WHY}`.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import json
 import os
 import socket
@@ -20,36 +22,42 @@ import aiohttp
 SLOW_BYTES_PER_S: Final = 1000
 SILENT_S: Final = 15.0
 """Duration of a connection that reads nothing, s: longer than the view's heartbeat of 10 s."""
+REPORT_S: Final = 5.0
+"""Time between two lines of what was received, s."""
 _STEP_S: Final = 0.1
 _NICENESS: Final = 10
-Viewer = Callable[[str, str], Coroutine[Any, Any, None]]
+Count = Callable[[], None]
+"""Called for every message that a page or Foxglove receives."""
+Viewer = Callable[[str, str, Count], Coroutine[Any, Any, None]]
 
 
-async def page(base: str, token: str) -> None:
+async def page(base: str, token: str, count: Count) -> None:
     """Read as the web page does."""
     async with aiohttp.ClientSession() as session, session.ws_connect(f"{base}/view?token={token}") as channel:
         async for _ in channel:
-            pass
+            count()
 
 
-async def foxglove(base: str, token: str) -> None:
+async def foxglove(base: str, token: str, count: Count) -> None:
     """Subscribe every channel and read."""
     address = f"{base}/foxglove?token={token}"
     async with aiohttp.ClientSession() as session, session.ws_connect(address, max_msg_size=0) as channel:
         async for message in channel:
-            if message.type is aiohttp.WSMsgType.TEXT and '"advertise"' in message.data:
+            if message.type is aiohttp.WSMsgType.BINARY:
+                count()
+            elif message.type is aiohttp.WSMsgType.TEXT and '"advertise"' in message.data:
                 channels = [each["id"] for each in json.loads(message.data)["channels"]]
                 wanted = [{"id": each, "channelId": each} for each in channels]
                 await channel.send_json({"op": "subscribe", "subscriptions": wanted})
 
 
-async def silent(base: str, token: str) -> None:
+async def silent(base: str, token: str, count: Count) -> None:
     """Connect as a page and read nothing; connect again later, because the view ends such a connection."""
     with _connected(urlsplit(base), token):
         await asyncio.sleep(SILENT_S)
 
 
-async def slow(base: str, token: str) -> None:
+async def slow(base: str, token: str, count: Count) -> None:
     """Connect as a page and read 1 kB/s."""
     loop = asyncio.get_running_loop()
     with _connected(urlsplit(base), token) as raw:
@@ -75,17 +83,32 @@ VIEWERS: Final[Mapping[str, tuple[Viewer, ...]]] = {
 }
 
 
-async def watch(url: str, viewers: str) -> None:
-    """Watch for ever; a viewer that the view disconnects comes back."""
+async def watch(url: str, viewers: str, report: Callable[[str], None] = print, period_s: float = REPORT_S) -> None:
+    """Watch for ever; a viewer that the view disconnects comes back. `report` takes a line every `period_s`."""
     base, token = url.split("/?token=")
+    named = {f"{viewer.__name__} {number}": viewer for number, viewer in enumerate(VIEWERS[viewers], 1)}
+    received = {name: 0 for name, viewer in named.items() if viewer in (page, foxglove)}
+    failure: str | None = None  # the newest, such as a refused connection
 
-    async def again(viewer: Viewer) -> None:
+    async def again(name: str, viewer: Viewer) -> None:
+        nonlocal failure
+
+        def count() -> None:
+            received[name] += 1
+
         while True:
-            with contextlib.suppress(aiohttp.ClientError, OSError):
-                await viewer(base, token)
+            try:
+                await viewer(base, token, count)
+            except (aiohttp.ClientError, OSError) as error:
+                failure = f"{name}: {error}"
             await asyncio.sleep(1.0)
 
-    await asyncio.gather(*(again(viewer) for viewer in VIEWERS[viewers]))
+    async def report_all() -> None:
+        while True:
+            await asyncio.sleep(period_s)
+            report(json.dumps({"received": received, "failure": failure}))
+
+    await asyncio.gather(report_all(), *(again(name, viewer) for name, viewer in named.items()))
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -93,7 +116,7 @@ def main(argv: list[str] | None = None) -> int:
     url, viewers = sys.argv[1:] if argv is None else argv
     os.nice(_NICENESS)
     with contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(watch(url, viewers))
+        asyncio.run(watch(url, viewers, functools.partial(print, flush=True)))
     return 0
 
 

@@ -5,12 +5,14 @@
 Of the viewers two are pages, one is Foxglove with every channel, one reads nothing and one reads 1 kB/s. No robot and
 no model runs. A reading is written to readings.jsonl every 10 s, so that an end by force loses nothing; SIGINT and
 SIGTERM end the stream and print what there is. The second half counts: growth of the private memory of the view, and
-of the process that feeds it, of at most 1 MB/h.
+of the process that feeds it, of at most 1 MB/h. It shows nothing if a page or Foxglove has received nothing, or if the
+view lacks more than 1 % of the messages.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import signal
 import sys
@@ -30,6 +32,7 @@ from edge.flightlog.schemas import SCHEMAS
 from edge.live.feed import LiveFeed
 from edge.live.options import LiveError, LiveOptions
 from firmware_bridge.system.terminal import CommandParser
+from sim_hil.processes.child_process import last_lines
 from sim_hil.realtime.children import Children, StepError
 from tools.bench import bad_input
 from tools.memory.gauge import LIMIT_MIB_PER_H, later_half, read_sizes
@@ -37,6 +40,8 @@ from tools.memory.gauge import LIMIT_MIB_PER_H, later_half, read_sizes
 PERIOD_S: Final = 10.0
 """Time between two readings, s."""
 PICTURES: Final = "/camera"
+MOST_DROPPED: Final = 0.01
+"""Share of the messages that the view may lack: without the pictures, a tenth or more, its memory shows nothing."""
 _FIVE: Final = "five viewers"
 _VIEW: Final = "edge.live.server"
 _SIZES: Final = ("private_dirty", "rss")
@@ -73,6 +78,7 @@ class Stream:
     def __init__(self, recording: Recording, folder: Path) -> None:
         self._recording, self._folder = recording, folder
         self._end = threading.Event()
+        self._sent = 0
         self.file = folder / "readings.jsonl"
 
     def stop(self, *_: object) -> None:
@@ -96,9 +102,10 @@ class Stream:
                     if not viewers.running:
                         raise viewers.failure("the viewers have ended")
                     sizes = {"feed": read_sizes(), "view": read_sizes(view.pid)}
-                    one = {"t_ns": time.monotonic_ns(), **sizes, "dropped": feed.dropped}
+                    one = {"t_ns": time.monotonic_ns(), **sizes, "sent": self._sent, "dropped": feed.dropped}
+                    one |= {"view_cpu_s": sum(view.cpu_times()[:2]), **newest_report(viewers.log)}
                     # Not kept: the feed's memory is judged too.
-                    file.write(json.dumps({**one, "view_cpu_s": sum(view.cpu_times()[:2])}) + "\n")
+                    file.write(json.dumps(one) + "\n")
                     file.flush()
                 self._end.set()
                 sending.join()
@@ -112,13 +119,24 @@ class Stream:
                 if self._end.wait(max(0.0, begin_s + into_s - time.monotonic())):
                     return
                 feed.put(topic, time.monotonic_ns(), payload)
+                self._sent += 1
             begin_s += self._recording.seconds
+
+
+def newest_report(log: Path) -> dict[str, Any]:
+    """Return the newest line of `tools.bench.live_viewers` in its log: `received` and `failure`; {} without one."""
+    for line in reversed(last_lines(log)):
+        with contextlib.suppress(ValueError):
+            found = json.loads(line)
+            if isinstance(found, dict) and "received" in found:
+                return found
+    return {}
 
 
 def judge(readings: Sequence[dict[str, Any]], hours: float) -> dict[str, Any]:
     """Return the growth of each process over the second half, and whether all of it is known and within the limit.
 
-    A stream that ended before `hours` shows nothing.
+    A stream that ended before `hours`, that a viewer did not receive or that lacks much shows nothing.
     """
     growth: dict[str, Any] = {}
     for name in JUDGED:
@@ -128,12 +146,22 @@ def judge(readings: Sequence[dict[str, Any]], hours: float) -> dict[str, Any]:
     private = [growth[name]["private_dirty"] for name in JUDGED]
     took_h = (readings[-1]["t_ns"] - readings[0]["t_ns"]) / 3.6e12 if readings else 0.0
     whole = took_h * 3600 >= hours * 3600 - 3 * PERIOD_S
+    last: dict[str, Any] = readings[-1] if readings else {"sent": 0, "dropped": 0}
+    received = last.get("received", {})
+    seen = bool(received) and all(count > 0 for count in received.values())
+    complete = last["dropped"] <= MOST_DROPPED * last["sent"]
     return {
         "hours": round(took_h, 3),
         "mib_per_h": growth,
         "limit_mib_per_h": LIMIT_MIB_PER_H,
-        "dropped": readings[-1]["dropped"] if readings else 0,
-        "ok": whole and all(one is not None and one["per_h"] <= LIMIT_MIB_PER_H for one in private),
+        "sent": last["sent"],
+        "dropped": last["dropped"],
+        "received": received,
+        "viewers_failure": last.get("failure"),
+        "ok": whole
+        and seen
+        and complete
+        and all(one is not None and one["per_h"] <= LIMIT_MIB_PER_H for one in private),
         "tagged": "measured",
     }
 
@@ -174,7 +202,9 @@ def main(argv: list[str] | None = None) -> int:
             else:
                 print(f"{name} {column}: {one['per_h']:+.2f} ({one['low']:+.2f} to {one['high']:+.2f}) MiB/h")
     verdict = "within the limit" if result["ok"] else "NOT SHOWN"
-    print(f"{result['hours']} of {args.hours} h, {result['dropped']} dropped: {verdict}")
+    received = ", ".join(f"{name} {count}" for name, count in result["received"].items()) or "nothing"
+    print(f"received by the viewers: {received}; their newest failure: {result['viewers_failure'] or 'none'}")
+    print(f"{result['hours']} of {args.hours} h, {result['dropped']} of {result['sent']} dropped: {verdict}")
     return EXIT_DONE if result["ok"] else EXIT_CHECK_FAILED
 
 

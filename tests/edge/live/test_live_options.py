@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import socket
 import stat
 from pathlib import Path
 
 import pytest
 
+from edge.live import options as options_module
 from edge.live.options import LiveError, LiveOptions, add_live_arguments, kept_token, live_options
 from firmware_bridge.core.config import ConfigError
 
@@ -55,6 +57,36 @@ def test_a_link_a_folder_and_a_short_token_are_refused(tmp_path: Path) -> None:
     for path in (tmp_path / "link", tmp_path, short, tmp_path / "missing" / "token"):
         with pytest.raises(LiveError, match="--live-token"):
             kept_token(path)
+
+
+@pytest.mark.parametrize(
+    ("address", "shown"),
+    [
+        ("127.0.0.1", "127.0.0.1"),
+        ("0.0.0.0", "127.0.0.1"),
+        ("::1", "[::1]"),
+        ("::", "[::1]"),  # asyncio listens there for IPv6 alone
+        ("fd00::7", "[fd00::7]"),
+        ("robot.local", "robot.local"),
+    ],
+)
+def test_the_printed_address_is_one_that_a_browser_of_this_machine_can_open(address: str, shown: str) -> None:
+    assert LiveOptions(address).url(8765, "t") == f"http://{shown}:8765/?token=t"
+
+
+def test_other_computers_get_an_address_of_their_own_where_every_interface_listens(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = LiveOptions("0.0.0.0").url_elsewhere(8765, "t")
+    assert found is not None and found.endswith(":8765/?token=t") and "127.0.0.1" not in found
+    assert LiveOptions().url_elsewhere(8765, "t") is None
+
+    class NoNetwork(socket.socket):
+        def connect(self, address: object) -> None:  # type: ignore[override]
+            raise OSError("no network")
+
+    monkeypatch.setattr(options_module.socket, "socket", NoNetwork)
+    assert LiveOptions("0.0.0.0").url_elsewhere(8765, "t") == f"http://{socket.gethostname()}:8765/?token=t"
 
 
 def test_without_a_file_every_run_has_a_new_token() -> None:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from edge.live.foxglove import Channels, ProtocolError, Subscriptions, server_info
 from edge.live.metrics import Metrics
 from edge.live.view import OVERLAY, LiveState
-from edge.live.wire import LISTENING, RECORD, Datagram, ViewConfig, WireError, decode
+from edge.live.wire import DROPPED, RECORD, Datagram, ViewConfig, WireError, decode
 from edge.safety.faults.table import FAULTS
 
 MOUNT = {"hfov_deg": 90.0, "height_m": 0.3, "pitch_deg": 0.0, "forward_m": 0.0}
@@ -61,7 +61,7 @@ def test_any_bytes_are_a_datagram_or_refused(data: bytes) -> None:
         found = decode(data)
     except WireError:
         return
-    assert RECORD <= found.kind <= LISTENING + 2
+    assert RECORD <= found.kind <= DROPPED
 
 
 def test_a_configuration_that_is_none_is_refused() -> None:
@@ -89,6 +89,24 @@ def test_a_waypoint_behind_the_robot_is_not_drawn() -> None:
     state = ready()
     state.record("/semantic", 3, {"waypoints": [[-3.0, 1.0]], "anchor_pose": [1.0, 2.0, 0.0]})
     assert overlay(state, tick())["waypoints"] == []
+
+
+@pytest.mark.parametrize("forward_m", [-0.2, 0.0, 0.4])
+def test_the_plan_is_drawn_from_the_floor_just_before_the_camera(forward_m: float) -> None:
+    """The same floor as the flight log's video: 0.15 m before the lens, wherever it is mounted."""
+    state = LiveState()
+    state.record("/run", 1, {"mount": {**MOUNT, "forward_m": forward_m}})
+    state.picture("/camera", 2, SIZE)
+    plan = overlay(state, tick(trajectory=[[3.0, 0.0, 0.0]]))["plan"]
+    from_lens_m = [0.3 / (v - 0.5) * 160 / 180 for _, v in plan]  # 0.3 m above the floor, 90° across 320 pixels
+    assert 0.15 < from_lens_m[0] < 0.15 + max(0.11, -forward_m + 0.01)
+
+
+@pytest.mark.parametrize("row", [[float("nan"), 0.0, 0.0], [float("inf"), 0.0, 0.0], [None, None, None]])
+def test_a_plan_that_is_not_finite_erases_the_one_before(row: list[float | None]) -> None:
+    state = ready()
+    assert overlay(state, tick())["plan"]
+    assert overlay(state, tick(trajectory=[[1.0, 0.0, 0.0], row])) == {"plan": [], "waypoints": []}
 
 
 def test_a_fault_carries_its_message_and_what_to_do() -> None:

@@ -10,7 +10,7 @@ import pytest
 from edge.flightlog.recorder import Recorder
 from tests.support.runner.injections import jpeg
 from tools.memory.gauge import MIB
-from tools.memory.stream import judge, main, read_recording
+from tools.memory.stream import judge, main, newest_report, read_recording
 
 
 def readings(view_mib_per_h: float, hours: float = 8.0, feed_mib_per_h: float = 0.0) -> list[dict[str, Any]]:
@@ -23,7 +23,8 @@ def readings(view_mib_per_h: float, hours: float = 8.0, feed_mib_per_h: float = 
             }
             for name, per_h in (("view", view_mib_per_h), ("feed", feed_mib_per_h))
         }
-        found.append({"t_ns": number * 10_000_000_000, "dropped": 3, **own})
+        one = {"t_ns": number * 10_000_000_000, "sent": 100 + 200 * number, "dropped": min(number, 3)}
+        found.append({**one, **own, "received": {"page 1": 5 + number, "foxglove 3": 9}, "failure": None})
     return found
 
 
@@ -49,6 +50,33 @@ class TestGrowth:
 
     def test_a_stream_that_ended_early_shows_nothing(self) -> None:
         assert not judge(readings(0.0), 9.0)["ok"]
+
+    @pytest.mark.parametrize("received", [{}, {"page 1": 0, "foxglove 3": 0}, {"page 1": 5, "foxglove 3": 0}])
+    def test_viewers_that_received_nothing_show_nothing(self, received: dict[str, int]) -> None:
+        found = readings(0.0)
+        found[-1] |= {"received": received, "failure": "page 1: 403"}
+        result = judge(found, 8.0)
+        assert not result["ok"] and result["received"] == received and result["viewers_failure"] == "page 1: 403"
+
+    def test_readings_without_a_line_of_the_viewers_show_nothing(self) -> None:
+        found = readings(0.0)
+        del found[-1]["received"], found[-1]["failure"]
+        assert not judge(found, 8.0)["ok"]
+
+    @pytest.mark.parametrize(("dropped", "ok"), [(990, True), (1010, False)])
+    def test_a_view_that_lacks_more_than_a_hundredth_shows_nothing(self, dropped: int, ok: bool) -> None:
+        """On a system whose datagrams are too small for pictures the view has little memory to grow."""
+        found = readings(0.0)
+        found[-1] |= {"sent": 100_000, "dropped": dropped}
+        assert judge(found, 8.0)["ok"] is ok
+
+    def test_the_newest_line_of_the_viewers_counts(self, tmp_path: Path) -> None:
+        log = tmp_path / "viewers.log"
+        assert newest_report(log) == {}
+        log.write_text('a warning\n{"received": {"page 1": 1}, "failure": null}\n')
+        with log.open("a") as file:
+            file.write('{"received": {"page 1": 7}, "failure": null}\nanother warning\n{"rec')
+        assert newest_report(log) == {"received": {"page 1": 7}, "failure": None}
 
 
 class TestRecording:
