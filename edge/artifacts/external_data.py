@@ -2,12 +2,13 @@
 
 ONNX and ONNX Runtime have each been patched several times for external data that leaves the model's folder (`..`,
 symlinks, hard links, unknown keys: faults page, "Model artifacts"). This module therefore does not use their parsers.
-It walks the protobuf wire format down to every tensor, and the caller compares the references with the manifest.
+It walks the protobuf wire format down to every tensor, and the caller compares the references with the manifest. The
+walk keeps one iterator per open message: a list of parts would take a hundred times the file's size for empty ones.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 TENSOR = "TensorProto"
@@ -26,6 +27,12 @@ FIELDS: Mapping[str, Mapping[int, str]] = {
 
 _EXTERNAL_DATA = 13  # of TensorProto: repeated {1: key, 2: value}
 _KEYS = frozenset({"location", "offset", "length", "checksum"})
+MAX_FIELDS = 1_000_000
+"""Most fields of a model outside its tensors' values; an export has up to some thousand."""
+MAX_DEPTH = 100
+"""Deepest nesting of messages: that of protobuf's own parsers."""
+MAX_ENTRY_BYTES = 1024
+"""Largest key and value of external data together, bytes: a file's name or a number."""
 _VARINT, _I64, _BYTES, _I32 = 0, 1, 2, 5
 
 
@@ -45,22 +52,31 @@ class ExternalData:
 
 def external_data(model: bytes) -> Iterator[ExternalData]:
     """Return every reference of an ONNX model to external data; raises ExternalDataError."""
-    waiting: list[tuple[str, memoryview]] = [("ModelProto", memoryview(model))]
-    while waiting:
-        kind, body = waiting.pop()
-        if kind == TENSOR:
-            entries = [entry for number, entry in _fields(body) if number == _EXTERNAL_DATA]
-            if entries:
-                yield _reference(entries)
-            continue
-        inside = FIELDS[kind]
-        waiting += [(inside[number], part) for number, part in _fields(body) if number in inside]
+    return _walk("ModelProto", memoryview(model), iter(range(MAX_FIELDS)), 1)
 
 
-def _reference(entries: list[memoryview]) -> ExternalData:
+def _walk(kind: str, body: memoryview, left: Iterator[int], depth: int) -> Iterator[ExternalData]:
+    """Yield the references inside a message; every field takes one of `left`."""
+    if depth > MAX_DEPTH:
+        raise ExternalDataError(f"messages nested deeper than {MAX_DEPTH} levels")
+    if kind == TENSOR:
+        reference = _reference((entry for number, entry in _fields(body, left) if number == _EXTERNAL_DATA), left)
+        if reference is not None:
+            yield reference
+        return
+    inside = FIELDS[kind]
+    for number, part in _fields(body, left):
+        if number in inside:
+            yield from _walk(inside[number], part, left, depth + 1)
+
+
+def _reference(entries: Iterable[memoryview], left: Iterator[int]) -> ExternalData | None:
+    """Return the reference of a tensor's entries; None without any."""
     found: dict[str, str] = {}
     for entry in entries:
-        pair = dict(_fields(entry))
+        if len(entry) > MAX_ENTRY_BYTES:
+            raise ExternalDataError(f"external data of {len(entry)} bytes, expected at most {MAX_ENTRY_BYTES}")
+        pair = dict(_fields(entry, left))
         try:
             key, value = (bytes(pair.get(number, b"")).decode("utf-8") for number in (1, 2))
         except UnicodeDecodeError as error:
@@ -68,6 +84,8 @@ def _reference(entries: list[memoryview]) -> ExternalData:
         if key not in _KEYS or key in found:
             raise ExternalDataError(f"external data with the key {key!r}, expected {sorted(_KEYS)} once each")
         found[key] = value
+    if not found:
+        return None
     numbers = {key: _number(key, found[key]) for key in ("offset", "length") if key in found}
     return ExternalData(found.get("location", ""), numbers.get("offset", 0), numbers.get("length"))
 
@@ -78,10 +96,12 @@ def _number(key: str, text: str) -> int:
     return int(text)
 
 
-def _fields(body: memoryview) -> Iterator[tuple[int, memoryview]]:
-    """Yield (number, content) of a message's length-delimited fields; skip the others."""
+def _fields(body: memoryview, left: Iterator[int]) -> Iterator[tuple[int, memoryview]]:
+    """Yield (number, content) of a message's length-delimited fields; skip the others. Each takes one of `left`."""
     at, end = 0, len(body)
     while at < end:
+        if next(left, None) is None:
+            raise ExternalDataError(f"more than {MAX_FIELDS} fields")
         tag, at = _varint(body, at)
         number, wire = tag >> 3, tag & 7
         if wire == _VARINT:

@@ -7,13 +7,14 @@ import json
 import os
 import re
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
 from firmware_bridge.core.version import ARTIFACT_SCHEMA
+from firmware_bridge.system.input_file import check_integers
 
 SCHEMA_VERSION = ARTIFACT_SCHEMA
 MANIFEST_NAME = "manifest.json"
@@ -38,6 +39,8 @@ MAX_BYTES = {".onnx.data": 64 << 30, ".onnx": 512 << 20, ".json": 64 << 20, ".ht
 """Largest file of each kind, bytes: checked before it is read. An export moves weights above 64 MB to a data file."""
 MAX_IN_MEMORY_BYTES = 2 << 30
 """All files together that are read into memory."""
+MAX_DATA_BYTES = 64 << 30
+"""All data files together, bytes: they are hashed at every start, a sparse one of any size costs its writer nothing."""
 
 
 class ArtifactError(ValueError):
@@ -109,6 +112,10 @@ def parse_manifest(directory: Path, raw: bytes) -> dict[str, Any]:
         raise
     except (ValueError, RecursionError) as error:
         raise ArtifactError(f"{path}: not JSON ({error})") from error
+    try:
+        check_integers(manifest)
+    except ValueError as error:
+        raise ArtifactError(f"{path}: {error}; export again") from error
     if not isinstance(manifest, dict):
         raise ArtifactError(f"{path}: expected a JSON object")
     version = manifest.get("schema_version")
@@ -164,13 +171,22 @@ def check_entry(name: str, entry: Any) -> None:
         raise ArtifactError(f"{MANIFEST_NAME}: {name} has {entry['bytes']} bytes, expected at most {most}")
 
 
-def check_files(files: Mapping[str, Any]) -> None:
-    """Check every listed file and the size of all that are read into memory; raises ArtifactError."""
+def check_files(files: Mapping[str, Any], data: Collection[str]) -> None:
+    """Check every listed file and the sizes of all together; raises ArtifactError.
+
+    `data`: the data files that the graphs name; they are mapped, all others are read into memory.
+    """
     for name, entry in files.items():
         check_entry(name, entry)
-    total = sum(entry["bytes"] for name, entry in files.items() if not name.endswith(".data"))
-    if total > MAX_IN_MEMORY_BYTES:
-        raise ArtifactError(f"{MANIFEST_NAME}: files of {total} bytes together, expected at most {MAX_IN_MEMORY_BYTES}")
+        if name.endswith(".data") and name not in data:
+            raise ArtifactError(f"{MANIFEST_NAME}: {name} is listed, but no graph names it; export again")
+    for kind, most, names in (
+        ("files", MAX_IN_MEMORY_BYTES, files.keys() - data),
+        ("data files", MAX_DATA_BYTES, files.keys() & data),
+    ):
+        total = sum(files[name]["bytes"] for name in names)
+        if total > most:
+            raise ArtifactError(f"{MANIFEST_NAME}: {kind} of {total} bytes together, expected at most {most}")
 
 
 def read_file(directory: Path, name: str, entry: Any) -> bytes:

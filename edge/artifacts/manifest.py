@@ -152,8 +152,8 @@ def load_artifacts(directory: Path, trust: Trust | None = None) -> Artifacts:
     release = None if trust is None else trust.check(directory, raw)
     manifest = parse_manifest(directory, raw)
     files = _section(manifest, "files")
-    check_files(files)
     data = {name for graph in _section(manifest, "graphs").values() for name in _data_files(graph)}
+    check_files(files, data)
     contents = {name: read_file(directory, name, entry) for name, entry in files.items() if name not in data}
     identities = {name: hash_file(directory, name, entry) for name, entry in files.items() if name in data}
     known = {*files, MANIFEST_NAME, SIGNATURE_NAME}

@@ -18,12 +18,16 @@ RANGES: Final[Mapping[str, tuple[float, float]]] = {
     "max_context": (32, 131072),
     "max_new_tokens": (1, 8192),
     "prefill_chunk_tokens": (1, 8192),
-    "tick_period_ms": (20, 1000),
+    "tick_period_ms": (20, 150),  # zero replaces a command that comes 200 ms after the last one (late_command.py)
     "step_s": (0.02, 0.5),
     "control_priority": (0, BRIDGE_PRIORITY - 1),
     **dict.fromkeys(("im_start_id", "im_end_id", "img_start_id", "img_end_id", "img_context_id"), (0, (1 << 20) - 1)),
 }
 """Smallest and largest plausible value of each number; a value outside is a typing error or an attack."""
+DELAY_S: Final = (0.1, 60.0)
+"""Smallest and largest plausible `max_delay_s`, s: a robot leaves the place of its semantic state within a minute."""
+BUDGET_W: Final = (0.1, 1000.0)
+"""Smallest and largest plausible power budget, W."""
 MAX_FRAMES: Final = 16
 OLDEST_FRAME_S: Final = 60.0
 MAX_CORES: Final = 1024
@@ -108,6 +112,8 @@ class RuntimeConfig:
         )
         apart = all(later - earlier >= period_s for earlier, later in itertools.pairwise(offsets))
         _require(apart, f"frame_offsets_s {list(offsets)} must grow by a tick of {period_s:g} s or more")
+        # The runner adds the newest frame to those above 0: without a 0 the prompt would have a frame too many.
+        _require(offsets[0] == 0, f"frame_offsets_s {list(offsets)} must begin with 0, the newest frame")
         needed = len(offsets) * self.frame_tokens + SHORTEST_TEXT_TOKENS + self.max_new_tokens
         _require(
             needed <= self.max_context,
@@ -155,6 +161,20 @@ def check_agreement(manifest: Mapping[str, Any], runtime: RuntimeConfig, steps: 
     used = max((*runtime.control_cores, *runtime.reasoning_cores), default=0)
     if isinstance(cores, int):
         _require(used < cores, f"core {used} is used, the target has the cores 0 to {cores - 1}")
+    check_plan(manifest)
+
+
+def check_plan(manifest: Mapping[str, Any]) -> None:
+    """Check a manifest's largest age of a semantic state and power budget, if any; raises ArtifactError."""
+    target = nested(manifest, "provenance", "target")
+    delay_s, budget_w = nested(manifest, "plan", "max_delay_s"), nested(target, "power", "budget_w")
+    for name, value, (least, most) in (("max_delay_s", delay_s, DELAY_S), ("budget_w", budget_w, BUDGET_W)):
+        sound = isinstance(value, int | float) and not isinstance(value, bool) and least <= value <= most
+        if value is not None and not sound:
+            raise ArtifactError(f"{MANIFEST_NAME}: {name} {value!r}, expected {least:g} to {most:g}; export again")
+    asked_s = nested(target, "runtime", "max_delay_s")
+    if delay_s is not None and asked_s not in (None, delay_s):
+        raise ArtifactError(f"{MANIFEST_NAME}: max_delay_s is {delay_s}, the target's is {asked_s!r}; export again")
 
 
 def nested(holder: Any, *keys: str) -> Any:

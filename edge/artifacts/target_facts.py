@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -12,6 +11,8 @@ from edge.artifacts.runtime import MAX_CORES
 
 GIB = 1 << 30
 MAX_MEMORY_BYTES = 16384 * GIB
+MAX_NUMBER = 2.0**53
+"""Largest number of a target or a plan, and its negative: a larger one has no exact float, or rounds to infinity."""
 MAX_PLANNED = 10_000_000
 """Largest plausible duration of a plan, ms (2.8 h), and number of tokens."""
 
@@ -116,8 +117,8 @@ def _mapping(holder: Mapping[str, Any], key: str) -> dict[str, Any]:
 
 def _number(holder: Mapping[str, Any], key: str) -> float:
     value = holder.get(key)
-    if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
-        raise ArtifactError(f"{MANIFEST_NAME}: {key} must be a number, found {value!r}; export again")
+    if not isinstance(value, int | float) or isinstance(value, bool) or not -MAX_NUMBER <= value <= MAX_NUMBER:
+        raise ArtifactError(f"{MANIFEST_NAME}: {key} must be a number up to 2^53, found {value!r}; export again")
     return float(value)
 
 

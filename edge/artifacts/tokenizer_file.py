@@ -54,7 +54,9 @@ def check_tokenizer_file(content: bytes, special: Mapping[str, int]) -> int:
     except (ValueError, RecursionError) as error:
         raise TokenizerFileError(f"not a tokenizer: not JSON ({type(error).__name__})") from error
     model = found.get("model") if isinstance(found, dict) else None
-    if not isinstance(model, dict) or not isinstance(model.get("vocab"), dict) or model.get("type") not in MODELS:
+    kind = model.get("type") if isinstance(model, dict) else None
+    known = isinstance(kind, str) and kind in MODELS
+    if not isinstance(model, dict) or not isinstance(model.get("vocab"), dict) or not known:
         raise TokenizerFileError(f"not a tokenizer: expected a model of {', '.join(sorted(MODELS))} with a vocabulary")
     for key in ("truncation", "padding"):
         _require(found.get(key) is None, f"{key} must be null: it changes the length of a prompt")

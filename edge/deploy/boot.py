@@ -31,7 +31,7 @@ class BootError(ValueError):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `edge-install boot`."""
     parser.add_argument("--watchdog", type=int, metavar="S", help="reset a kernel that hangs for S seconds, e.g. 30")
-    parser.add_argument("--power-mode", metavar="NAME", help="start a Jetson in this mode, e.g. 25W (nvpmodel)")
+    parser.add_argument("--power-mode", metavar="NAME", help="start a Jetson in this mode, e.g. 40W (nvpmodel)")
     parser.add_argument("--dry-run", action="store_true", help="print what would be set only")
 
 

@@ -36,7 +36,7 @@ EXAMPLES = """examples:
   edge-install dds
   sudo edge-install board --wheel tic_vla_edge-0.1.0-py3-none-any.whl --artifacts out/cpu --extras cpu,unitree
   sudo edge-install rollback
-  sudo edge-install boot --watchdog 30 --power-mode 25W
+  sudo edge-install boot --watchdog 30 --power-mode 40W
 
 units needs a robot file with operator_arm = true in [safety], or --arm-at-start. An interrupted build of engines keeps
 the finished ones: run it again to go on.

@@ -93,6 +93,7 @@ class GenerationTask:
         constraint = language.constraint(self._context)
         generation = run.finish(rest, max_new_tokens=self.max_new_tokens, constraint=constraint)
         if not np.isfinite(generation.last_layer_kv).all():
+            language.kept_ids = ()  # a retry that kept these rows would fail as well
             raise NotFiniteError("keys and values of the last layer are not finite")
         before_context()
         context = policy.semantic_context(generation.last_layer_kv, interrupt)

@@ -84,6 +84,44 @@ class Binding:
             raise GraphError(f"{self._graph}: output {name}: {str(error).splitlines()[0]}") from error
 
 
+def session_settings(
+    artifacts: Artifacts,
+    name: str,
+    *,
+    threads: int | None = None,
+    provider: str | None = None,
+    cores: Collection[int] = (),
+) -> tuple[ort.SessionOptions, list[tuple[str, dict[str, str]]]]:
+    """Return the options of a graph's session, and its provider with its options; the arguments are those of Graph."""
+    import onnxruntime as ort
+
+    contract = artifacts.graphs[name]
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = threads or contract.session.threads or 1
+    if cores and options.intra_op_num_threads > 1:
+        # The calling thread is the first of them; ONNX Runtime counts processors from 1.
+        worker = ",".join(str(core + 1) for core in sorted(cores))
+        affinities = ";".join([worker] * (options.intra_op_num_threads - 1))
+        options.add_session_config_entry("session.intra_op_thread_affinities", affinities)
+    options.inter_op_num_threads = 1
+    if any(CONTEXT_AXIS in tensor.shape for tensor in contract.inputs):
+        # ONNX Runtime keeps a plan of memory for every length of the context that it has seen: some KiB each.
+        options.enable_mem_pattern = False
+    # A spinning worker would occupy the other thread's core.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.log_severity_level = 3
+    # A graph opened from bytes would read external weights from the working directory. It may read them from its
+    # own directory if the manifest lists them; otherwise point it at a folder that does not exist.
+    weights = artifacts.directory if contract.data_files else artifacts.directory / "no-external-data"
+    options.add_session_config_entry("session.model_external_initializers_file_folder_path", str(weights))
+    chosen = provider or contract.session.provider
+    given = contract.session.options if provider is None else {}
+    if chosen == OPENVINO:
+        # It would leave nodes that it does not know to ONNX Runtime without a message.
+        options.add_session_config_entry("session.disable_cpu_ep_fallback", "1")
+    return options, [(chosen, opened_with(chosen, given, options.intra_op_num_threads))]
+
+
 class Graph:
     """A session with the execution provider and threads of the manifest, or of an argument.
 
@@ -108,36 +146,13 @@ class Graph:
         import onnxruntime as ort
 
         contract = artifacts.graphs[name]
-        options = ort.SessionOptions()
-        options.intra_op_num_threads = threads or contract.session.threads or 1
-        if cores and options.intra_op_num_threads > 1:
-            # The calling thread is the first of them; ONNX Runtime counts processors from 1.
-            worker = ",".join(str(core + 1) for core in sorted(cores))
-            affinities = ";".join([worker] * (options.intra_op_num_threads - 1))
-            options.add_session_config_entry("session.intra_op_thread_affinities", affinities)
-        options.inter_op_num_threads = 1
-        if any(CONTEXT_AXIS in tensor.shape for tensor in contract.inputs):
-            # ONNX Runtime keeps a plan of memory for every length of the context that it has seen: some KiB each.
-            options.enable_mem_pattern = False
-        # A spinning worker would occupy the other thread's core.
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        options.log_severity_level = 3
-        # A graph opened from bytes would read external weights from the working directory. It may read them from its
-        # own directory if the manifest lists them; otherwise point it at a folder that does not exist.
-        weights = artifacts.directory if contract.data_files else artifacts.directory / "no-external-data"
-        options.add_session_config_entry("session.model_external_initializers_file_folder_path", str(weights))
         self.provider = provider or contract.session.provider
         if self.provider not in ort.get_available_providers():
             raise ArtifactError(
                 f"{contract.file}: made for {self.provider}, this ONNX Runtime has {ort.get_available_providers()}; "
                 f"install the package that brings it or export for another target"
             )
-        given = contract.session.options if provider is None else {}
-        provider_options = opened_with(self.provider, given, options.intra_op_num_threads)
-        if self.provider == OPENVINO:
-            # It would leave nodes that it does not know to ONNX Runtime without a message.
-            options.add_session_config_entry("session.disable_cpu_ep_fallback", "1")
-        providers = [(self.provider, provider_options)]
+        options, providers = session_settings(artifacts, name, threads=threads, provider=provider, cores=cores)
         try:
             self._session = ort.InferenceSession(
                 artifacts.contents[contract.file], sess_options=options, providers=providers

@@ -22,7 +22,7 @@ from edge.core.geometry import SE2
 from edge.inference.calls import Call, Chunk, Floats, chunks, set_first_apart, set_last_apart
 from edge.inference.graph import DTYPES, CancelledError, Graph, GraphError, Interrupt, zeros
 from edge.inference.scheduling import Schedule, run_as
-from edge.inference.speculation import FIRST_TEXT, Speculator, TextUnderWay, exact_calls_ns, next_rows
+from edge.inference.speculation import FIRST_TEXT, Speculator, TextUnderWay, exact_calls_ns, most_rows, next_rows
 from edge.reasoning.decoding_rules import DecodingContext, TextConstraint
 from edge.reasoning.prompt import (
     EXAMPLE_BEFORE,
@@ -221,12 +221,14 @@ class LanguageModel:
         self.speculator = Speculator(first, call_ns, self.ends_line, is_number)
 
     def run(self, call: Call, chunk: Chunk, past: int, interrupt: Interrupt | None) -> list[int]:
-        """Feed a chunk after `past` tokens; return what `Call` does. Raises GraphError."""
-        self.kept_ids = self.kept_ids[:past]
+        """Feed a chunk after `past` tokens; return what `Call` does. Raises GraphError; then no rows are kept."""
+        # A failed call may have been given damaged rows, which every retry would reuse.
+        kept, self.kept_ids = self.kept_ids[:past], ()
         started_ns = time.monotonic_ns()
         next_ids = call(chunk, past, self._kv, interrupt)
         if not all(0 <= token < MAX_TOKENS for token in next_ids):
             raise GraphError(f"the language model's next tokens are {next_ids}, expected ids of its vocabulary")
+        self.kept_ids = kept
         self._took_ns[len(chunk.ids)] = time.monotonic_ns() - started_ns
         return next_ids
 
@@ -310,15 +312,15 @@ class GenerationRun:
 
         Returns the tokens to feed next; [] at the end of the text.
         """
-        model = self._model
-        most = model.rows[-1] if model.speculator is None else model.speculator.rows[-1]
-        while len(pending) > most:
+        model, speculator = self._model, self._model.speculator
+        longest = (model.rows if speculator is None else speculator.rows)[-1]
+        while len(pending) > (most := min(longest, most_rows(model.rows, model.runtime.max_context - self._fed))):
             self._run_rows(pending[:most])
             text.call_tokens.append(most)
             self._fed += most
             pending = pending[most:]
-        speculator = model.speculator
         guesses = [] if speculator is None else speculator.guess(text, len(pending), self._longest_guess_ns())
+        guesses = guesses[: most - len(pending)]
         choices = self._run_rows([*pending, *guesses])[len(pending) - 1 :]
         self._fed += len(pending)
         text.call_tokens.append(len(pending) + len(guesses))

@@ -176,7 +176,7 @@ def _of_flight_log(path: Path) -> LatencyProfile:
                 anchors.append(anchor_s)
     except RecordingError as error:
         raise LatencyError(str(error)) from error
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, OverflowError, TypeError, ValueError) as error:
         raise LatencyError(f"a /semantic record lacks or misshapes a field: {error!r}") from error
     if not times:
         raise LatencyError("expected generations in the flight log, found none")
@@ -215,4 +215,5 @@ def _calls(value: object) -> tuple[tuple[int, float], ...]:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    # An integer of TOML has any length; `float` raises an OverflowError for a long one.
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 2**53

@@ -85,6 +85,11 @@ def next_rows(permitted: Sequence[int], tokens: int) -> int:
     return next((rows for rows in permitted if rows >= tokens), permitted[-1])
 
 
+def most_rows(permitted: Sequence[int], room: int) -> int:
+    """Return the largest permitted number of rows within `room` positions, else the smallest; `permitted` ascends."""
+    return next((rows for rows in reversed(permitted) if rows <= room), permitted[0])
+
+
 @dataclass
 class TextUnderWay:
     """The new tokens of one generation, and counts of the calls that chose them."""

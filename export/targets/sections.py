@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from edge.artifacts.runtime import MAX_CORES, MAX_FRAMES, OLDEST_FRAME_S, RANGES
+from edge.artifacts.runtime import BUDGET_W, DELAY_S, MAX_CORES, MAX_FRAMES, OLDEST_FRAME_S, RANGES
 from edge.state.switches import Decoding, RecoverySwitch, Speculation
 from export.core.typed import from_text, near
 from export.quantize.precision import PRECISIONS, Precision, block_size
@@ -109,7 +109,11 @@ class Power:
     def __post_init__(self) -> None:
         _known(self.mode, dict(self.modes), "power.mode")
         _known(self.meter, METERS, "power.meter")
-        _require(self.budget_w is None or 0 < self.budget_w < 1000, f"budget_w {self.budget_w} must be 0 to 1000 W")
+        least_w, most_w = BUDGET_W
+        _require(
+            self.budget_w is None or least_w <= self.budget_w <= most_w,
+            f"budget_w {self.budget_w} must be {least_w:g} to {most_w:g} W",
+        )
         if self.budget_w is not None:
             _require(self.idle_w is not None, "idle_w is missing: a budget cannot be planned for without it")
             lacking = [name for name, mode in self.modes.items() if mode.busy_w is None]
@@ -336,6 +340,10 @@ class RuntimePolicy:
             all(later - earlier >= period_s for earlier, later in itertools.pairwise(self.frame_offsets_s)),
             f"frame_offsets_s {list(self.frame_offsets_s)} must grow by a tick of {period_s:g} s or more",
         )
+        _require(
+            self.frame_offsets_s[0] == 0,
+            f"frame_offsets_s {list(self.frame_offsets_s)} must begin with 0, the newest frame",
+        )
         _known(self.kv_dtype, KV_DTYPES, "kv_dtype")
         _known(self.decoding, tuple(each.value for each in Decoding), "decoding")
         _known(self.recovery, tuple(each.value for each in RecoverySwitch), "recovery")
@@ -350,7 +358,10 @@ class RuntimePolicy:
             f"control_priority {self.control_priority} must be 0 to {BRIDGE_PRIORITY - 1}, below the bridge's "
             f"{BRIDGE_PRIORITY}",
         )
-        _require(0 < self.max_delay_s <= 600, f"max_delay_s {self.max_delay_s} must be 0 to 600 s")
+        least_s, most_s = DELAY_S
+        _require(
+            least_s <= self.max_delay_s <= most_s, f"max_delay_s {self.max_delay_s} must be {least_s:g} to {most_s:g} s"
+        )
 
 
 @dataclass(frozen=True)

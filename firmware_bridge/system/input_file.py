@@ -21,6 +21,9 @@ else:
 
 MAX_BYTES: Final = 64_000_000
 """Default limit of a file's size, bytes: above every TOML or JSON file of this project."""
+MAX_INTEGER: Final = 2**63 - 1
+"""Largest integer of a JSON file, and its negative: every stamp in ns fits. `float` of a far longer one raises an
+OverflowError, which no reader expects. Readers of TOML check each number by its key."""
 _MAX_KEY_PARTS: Final = 1000  # tomllib takes time that grows with their square
 _TOO_DEEP: Final = "nested too deeply"
 
@@ -77,8 +80,23 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Parse JSON. Raises ValueError, also for nesting that is too deep."""
+    """Parse JSON. Raises ValueError, also for nesting that is too deep and integers that are too large."""
     try:
-        return json.loads(text)
+        content = json.loads(text)
     except RecursionError:
         raise ValueError(_TOO_DEEP) from None
+    check_integers(content)
+    return content
+
+
+def check_integers(content: object) -> None:
+    """Raise ValueError for an integer beyond MAX_INTEGER anywhere in parsed JSON; without recursion."""
+    waiting = [content]
+    while waiting:
+        value = waiting.pop()
+        if isinstance(value, dict):
+            waiting += value.values()
+        elif isinstance(value, list):
+            waiting += value
+        elif isinstance(value, int) and not -MAX_INTEGER <= value <= MAX_INTEGER:
+            raise ValueError(f"an integer of {value.bit_length()} bits, expected at most {MAX_INTEGER}")

@@ -18,7 +18,7 @@ from edge.artifacts.manifest import Artifacts, GraphContract
 from edge.artifacts.target_facts import PlanFacts
 from edge.core.geometry import SE2
 from edge.deploy.doctor.check import Check, Level, skipped
-from edge.inference.graph import CPU_PROVIDER, Array, zeros
+from edge.inference.graph import CPU_PROVIDER, Array, session_settings, zeros
 from edge.inference.policy import Policy
 from edge.inference.warm_up import open_proven
 from edge.state.semantic import STRAIGHT_AHEAD, SemanticState
@@ -98,17 +98,11 @@ def profile_graph(artifacts: Artifacts, name: str) -> Check:
     contract = artifacts.graphs[name]
     wanted = contract.session.provider
     with tempfile.TemporaryDirectory(prefix="edge-doctor-") as folder:
-        options = ort.SessionOptions()
-        options.intra_op_num_threads = contract.session.threads or 1
-        options.log_severity_level = 3
-        weights = artifacts.directory if contract.data_files else artifacts.directory / "no-external-data"
-        options.add_session_config_entry("session.model_external_initializers_file_folder_path", str(weights))
+        options, providers = session_settings(artifacts, name)
         options.enable_profiling = True
         options.profile_file_prefix = str(Path(folder) / "profile")
         try:
-            session = ort.InferenceSession(
-                artifacts.contents[contract.file], options, providers=[(wanted, dict(contract.session.options))]
-            )
+            session = ort.InferenceSession(artifacts.contents[contract.file], options, providers=providers)
             session.run(None, example_feeds(artifacts, contract))
             events = json.loads(Path(session.end_profiling()).read_text(encoding="utf-8"))
             return judge_placement(name, wanted, placements(events))

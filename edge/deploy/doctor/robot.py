@@ -35,7 +35,7 @@ _ADVICE: Final = {
     "unsafe_robot": "the robot's own protection is weaker than the robot file requires: correct on the robot what the"
     " bridge names, then restart edge-bridge",
     "link_down": "the bridge cannot send: plug in the robot's cable or adapter; the checks of the link say more",
-    "state_silent": "the bridge hears nothing: is the robot on, and does the robot file name its address and rates?",
+    "state_silent": "the bridge receives no state: switch the robot on, then check address and rates in the robot file",
     "second_publisher": "two robots, a forger or a motor-command program are on this network: leave one robot on it",
 }
 """What to do where arming is refused, by cause."""

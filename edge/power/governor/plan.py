@@ -9,10 +9,15 @@ from typing import Any, Final
 
 from edge.artifacts.files import MANIFEST_NAME, SEAL, ArtifactError, read_manifest
 from edge.artifacts.manifest import Artifacts
+from edge.artifacts.runtime import check_plan
 from edge.power.meters.meter import MEASURED, MODELLED
 
 STAGES: Final = ("vision_encoder", "action_expert", "prefill", "decode", "semantic_context")
 """Units of their counts: calls, calls, whole prompts, new tokens, calls."""
+MOST: Final = 1e6
+"""Largest plausible number of a power model, W, s or J."""
+LEAST_S: Final = 1e-6
+"""Smallest plausible duration of a period and a generation, s: no power above idle becomes infinite."""
 
 
 @dataclass(frozen=True)
@@ -35,10 +40,10 @@ class PowerModel:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if name != "tagged" and not (math.isfinite(value) and value >= 0):
-                raise ValueError(f"{name} must be 0 or more, found {value}")
-        if self.period_s <= 0 or self.before_text_s <= 0:
-            raise ValueError("period_s and before_text_s must be positive")
+            if name != "tagged" and not 0 <= value <= MOST:
+                raise ValueError(f"{name} must be 0 to {MOST:g}, found {value}")
+        if min(self.period_s, self.before_text_s) < LEAST_S:
+            raise ValueError(f"period_s and before_text_s must be at least {LEAST_S:g} s")
         if self.tagged not in (MEASURED, MODELLED):
             raise ValueError(f"tagged must be {MEASURED} or {MODELLED}, found {self.tagged!r}")
 
@@ -83,6 +88,7 @@ def read_power_plan(artifacts: Artifacts) -> PowerPlan:
 
 def power_plan(manifest: Mapping[str, Any], max_new_tokens: int) -> PowerPlan:
     """Build the power plan from a manifest's `plan` and its target's `power`; raises ArtifactError."""
+    check_plan(manifest)
     try:
         plan = manifest["plan"]
         target = manifest["provenance"].get("target", {})
@@ -96,7 +102,7 @@ def power_plan(manifest: Mapping[str, Any], max_new_tokens: int) -> PowerPlan:
             max_new_tokens=max_new_tokens,
             model=_model(plan, power),
         )
-    except (AttributeError, KeyError, TypeError, ValueError, ZeroDivisionError) as error:
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError, ZeroDivisionError) as error:
         raise ArtifactError(f"{MANIFEST_NAME}: plan or target lacks what the power budget needs ({error!r})") from error
 
 

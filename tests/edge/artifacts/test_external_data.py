@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import tracemalloc
 
 import onnx
 import pytest
@@ -11,7 +12,28 @@ from hypothesis import given
 from hypothesis import strategies as st
 from onnx import helper
 
-from edge.artifacts.external_data import FIELDS, TENSOR, ExternalData, ExternalDataError, external_data
+from edge.artifacts import external_data as module
+from edge.artifacts.external_data import (
+    FIELDS,
+    MAX_DEPTH,
+    MAX_ENTRY_BYTES,
+    TENSOR,
+    ExternalData,
+    ExternalDataError,
+    external_data,
+)
+
+GRAPH, NODE, ATTRIBUTE, SUBGRAPH = (bytes([number << 3 | 2]) for number in (7, 1, 5, 6))
+"""Tags of a model's graph, its nodes, their attributes, and the graph in an attribute."""
+
+
+def field(tag: bytes, body: bytes) -> bytes:
+    """A length-delimited field."""
+    size, length = len(body), bytearray()
+    while size >= 0x80:
+        length.append(size & 0x7F | 0x80)
+        size >>= 7
+    return tag + bytes([*length, size]) + body
 
 
 def paths_to_tensors() -> dict[str, dict[int, str]]:
@@ -73,6 +95,42 @@ def test_a_graph_given_twice_hides_nothing() -> None:
     merged = first.SerializeToString() + second.SerializeToString()
     assert len(onnx.ModelProto.FromString(merged).graph.initializer) == 1
     assert [data.location for data in external_data(merged)] == ["hidden"]
+
+
+def test_a_graph_of_empty_nodes_takes_no_multiple_of_its_size_in_memory() -> None:
+    model = field(GRAPH, field(NODE, b"") * 20_000)
+    tracemalloc.start()
+    try:
+        assert not list(external_data(model))
+        _, peak_bytes = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak_bytes < len(model)
+
+
+def test_a_model_of_endless_fields_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MAX_FIELDS", 1000)
+    assert not list(external_data(field(GRAPH, field(NODE, b"") * 999)))
+    with pytest.raises(ExternalDataError, match="more than 1000 fields"):
+        list(external_data(field(GRAPH, field(NODE, b"") * 1000)))
+
+
+@pytest.mark.parametrize("levels", [MAX_DEPTH // 3 - 1, MAX_DEPTH // 3 + 1])
+def test_graphs_are_nested_up_to_a_limit(levels: int) -> None:
+    graph = b""
+    for _ in range(levels):
+        graph = field(NODE, field(ATTRIBUTE, field(SUBGRAPH, graph)))
+    refused = pytest.raises(ExternalDataError, match="nested deeper than 100 levels")
+    with refused if levels > MAX_DEPTH // 3 else contextlib.nullcontext():
+        assert not list(external_data(field(GRAPH, graph)))
+
+
+def test_a_long_entry_of_external_data_is_refused() -> None:
+    model = onnx.ModelProto(
+        graph=helper.make_graph([], "g", [], [], initializer=[outside("w" * (MAX_ENTRY_BYTES + 1))])
+    )
+    with pytest.raises(ExternalDataError, match=r"external data of \d+ bytes, expected at most 1024"):
+        list(external_data(model.SerializeToString()))
 
 
 @given(st.binary(max_size=300))

@@ -58,6 +58,10 @@ REFUSED: dict[str, tuple[Edit, str]] = {
         "<img> is id 4, the network was built for 3",
     ),
     "no model": (lambda t: t.pop("model"), "not a tokenizer: expected a model of BPE"),
+    "a kind of model that is no text": (
+        lambda t: t["model"].update(type=[]),
+        "not a tokenizer: expected a model of BPE",
+    ),
     "another kind of model": (lambda t: t["model"].update(type="Unigram"), "not a tokenizer: expected a model of BPE"),
 }
 

@@ -18,7 +18,7 @@ from edge.artifacts.files import ArtifactError, seal
 from edge.artifacts.manifest import Artifacts
 from edge.artifacts.target_facts import GIB, PlanFacts, plan_facts, target_facts
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE
-from edge.core.device import CUDA
+from edge.core.device import CUDA, OPENVINO
 from edge.deploy.doctor.check import Check, Level
 from edge.deploy.doctor.command import examine, main, parser
 from edge.deploy.doctor.graphs import Placement, judge_placement, judge_ticks, placements, profile_graph
@@ -93,6 +93,28 @@ def test_a_graph_that_onnx_runtime_quietly_runs_on_the_processor_instead_fails(a
     )
     assert check.level is Level.FAIL
     assert "nodes on CPUExecutionProvider" in check.found
+
+
+def test_a_graph_is_profiled_with_the_options_that_the_runner_gives_to_its_provider(
+    artifacts: Artifacts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    graph = artifacts.graphs["vision_encoder"]
+    session = dataclasses.replace(graph.session, provider=OPENVINO, options={"inference_precision": "bf16"}, threads=3)
+    moved = {**artifacts.graphs, "vision_encoder": dataclasses.replace(graph, session=session)}
+    opened: list[tuple[Any, Any]] = []
+
+    def refuse(_content: bytes, options: Any, providers: Any) -> None:
+        opened.append((options, providers))
+        raise RuntimeError("no such library")
+
+    monkeypatch.setattr("onnxruntime.InferenceSession", refuse)
+    check = profile_graph(dataclasses.replace(artifacts, graphs=moved), "vision_encoder")
+    assert check.level is Level.FAIL and "no such library" in check.found
+    ((options, providers),) = opened
+    hint = '{"CPU": {"INFERENCE_PRECISION_HINT": "bf16"}}'
+    assert providers == [(OPENVINO, {"num_of_threads": "3", "load_config": hint})]
+    assert options.get_session_config_entry("session.disable_cpu_ep_fallback") == "1"
+    assert options.enable_profiling
 
 
 @pytest.mark.parametrize(
@@ -294,6 +316,14 @@ def test_with_a_dash_standard_output_is_the_json_alone(tmp_path: Path, capsys: p
     output = capsys.readouterr()
     assert json.loads(output.out)["checks"]
     assert "clock" in output.err
+
+
+@pytest.mark.parametrize("memory_gib", [1e308, 10**400])
+def test_a_memory_that_rounds_to_infinity_is_refused(memory_gib: float) -> None:
+    target = load_target("cpu").to_dict()
+    target["device"]["memory_gib"] = memory_gib
+    with pytest.raises(ArtifactError, match=r"memory_gib must be a number up to 2\^53"):
+        target_facts({"provenance": {"target": target}})
 
 
 @pytest.mark.parametrize(

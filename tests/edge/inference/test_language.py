@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import cast
 
 import numpy as np
 import pytest
@@ -11,8 +12,8 @@ from hypothesis import strategies as st
 
 from edge.artifacts.manifest import Artifacts, load_artifacts
 from edge.core.geometry import SE2
-from edge.inference.calls import Chunk, chunks, set_last_apart
-from edge.inference.graph import CancelledError, Interrupt
+from edge.inference.calls import Call, Chunk, chunks, set_last_apart
+from edge.inference.graph import CancelledError, GraphError, Interrupt
 from edge.inference.language import ContextOverflowError, LanguageModel
 from edge.reasoning.prompt import Segment
 from edge.state.ring import EncodedFrame
@@ -109,6 +110,21 @@ def test_rows_of_an_interrupted_call_are_not_kept(artifacts: Artifacts) -> None:
     run = language.begin(lambda: False, interrupt=interrupt, before_call=lambda _: interrupt.set())
     with pytest.raises(CancelledError):
         run.feed(language.prompt.build(frames(1, 64, 256), SENTENCE)[:1])
+    assert language.kept_ids == ()
+
+
+def test_no_rows_are_kept_after_a_failed_call(artifacts: Artifacts) -> None:
+    language = model(artifacts, 64)
+    segments = language.prompt.build(frames(1, 64, 256), "stop")
+    language.generate(segments, max_new_tokens=2, cancelled=lambda: False)
+    assert language.kept_ids
+
+    def fail(*_: object) -> list[int]:
+        raise GraphError("the device is lost")
+
+    language.decode_call = cast("Call", fail)
+    with pytest.raises(GraphError):
+        language.generate(segments, max_new_tokens=2, cancelled=lambda: False)
     assert language.kept_ids == ()
 
 

@@ -55,6 +55,7 @@ def test_an_invalid_delay_is_refused(bad: str) -> None:
         {"schema": 1, "mean_s": 5, "high_s": 4},
         {"schema": 1, "mean_s": 5, "sd_s": 1e-200},
         {"schema": 1, "mean_s": 5, "sd_s": 1e300},
+        {"schema": 1, "mean_s": 10**400},
     ],
 )
 def test_a_wrong_profile_is_refused(tmp_path: Path, content: dict[str, object]) -> None:

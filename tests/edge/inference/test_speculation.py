@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import cast
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge.artifacts.manifest import LEAST_ROWS, MOST_ROWS, Artifacts, load_artifacts
+from edge.inference.calls import Call, Chunk
 from edge.inference.graph import CancelledError, Interrupt
 from edge.inference.language import Generation, LanguageModel
 from edge.inference.speculation import (
@@ -20,9 +22,11 @@ from edge.inference.speculation import (
     EarlierTexts,
     Speculator,
     TextUnderWay,
+    most_rows,
     next_rows,
 )
 from edge.reasoning.decoding_rules import EITHER_WAY, ONWARD, DecodingContext, LineConstraint, TurnDistances
+from edge.reasoning.prompt import Segment
 from edge.state.reasoning_text import Progress, parse_text
 from tests.edge.inference.test_language import SENTENCE, frames
 from tests.support.scripted_model import decode_script, ids_of
@@ -143,6 +147,7 @@ def test_no_guess_exceeds_the_limit_of_the_text() -> None:
 def test_a_call_has_a_permitted_number_of_rows() -> None:
     some = speculator({2: 1.0, 4: 1.1, 8: 9.0})
     assert [next_rows(some.rows, tokens) for tokens in (1, 2, 3, 4, 5, 8, 9)] == [2, 2, 4, 4, 8, 8, 8]
+    assert [most_rows(some.rows, room) for room in (1, 2, 3, 4, 7, 8, 99)] == [2, 2, 2, 4, 4, 8, 8]
     assert some.length([1] * 7, 7, 1, math.inf) == 3
 
 
@@ -219,6 +224,30 @@ def test_a_repeated_text_takes_few_calls(scripted: Models) -> None:
     made, _ = decode_script(guessing, text, DecodingContext())
     assert made.accepted == made.guessed >= 20
     assert len(made.call_tokens) <= math.ceil((made.new_tokens + 1) / MOST_ROWS)
+
+
+@pytest.mark.parametrize("prompt_tokens", range(450, 458))
+def test_up_to_the_end_of_the_context_a_call_has_a_permitted_number_of_rows(
+    scripted: Models, prompt_tokens: int
+) -> None:
+    """Every guess is right, so that the last calls are as long as the context allows."""
+    _, guessing = scripted
+    token, permitted, fed = ids_of(guessing, "corridor")[0], (2, 4, 8), list[int]()
+    guessing.rows = permitted
+    guessing.guess_for(dict.fromkeys(permitted, 1.0))
+    assert guessing.speculator is not None
+    guessing.speculator.end([token] * guessing.runtime.max_context)
+
+    def repeat(chunk: Chunk, *_: object) -> list[int]:
+        fed.append(len(chunk.ids))
+        return [token] * len(chunk.ids)
+
+    guessing.kept_ids = ()
+    guessing.prefill_call, guessing.decode_call = cast("Call", lambda *_: []), cast("Call", repeat)
+    segments = [Segment((token,) * prompt_tokens, None)]
+    made = guessing.generate(segments, max_new_tokens=guessing.runtime.max_context, cancelled=lambda: False)
+    assert made.prompt_tokens + made.new_tokens == guessing.runtime.max_context - 1
+    assert 8 in fed and set(fed) <= set(permitted)
 
 
 def test_the_first_text_is_guessed_from_one_that_the_grammar_writes() -> None:

@@ -372,7 +372,7 @@ def test_a_plan_without_energies_gives_no_model() -> None:
 
 def test_a_plan_that_is_damaged_is_refused_in_one_line() -> None:
     with pytest.raises(ArtifactError, match="lacks what the power budget needs"):
-        power_plan({"plan": {"max_delay_s": "long"}, "provenance": {}}, 48)
+        power_plan({"plan": [], "provenance": {}}, 48)
 
 
 def test_a_budget_of_nothing_is_refused() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from firmware_bridge.system.input_file import parse_json, parse_toml, read_bytes, read_json, read_toml
+from firmware_bridge.system.input_file import MAX_INTEGER, parse_json, parse_toml, read_bytes, read_json, read_toml
 
 
 def test_a_small_file_is_read(tmp_path: Path) -> None:
@@ -43,6 +43,16 @@ def test_a_directory_is_refused(tmp_path: Path) -> None:
 def test_deep_json_is_a_value_error(text: str) -> None:
     with pytest.raises(ValueError, match="nested too deeply"):
         parse_json(text)
+
+
+@pytest.mark.parametrize("number", [MAX_INTEGER + 1, -MAX_INTEGER - 1, 10**400])
+def test_an_integer_of_json_that_would_overflow_a_float_or_64_bits_is_a_value_error(number: int) -> None:
+    with pytest.raises(ValueError, match=rf"an integer of \d+ bits, expected at most {MAX_INTEGER}"):
+        parse_json(f'{{"a": [1.5, {{"b": {number}}}]}}')
+
+
+def test_a_stamp_in_nanoseconds_is_read_from_json() -> None:
+    assert parse_json(f"[{MAX_INTEGER}, {-MAX_INTEGER}]") == [MAX_INTEGER, -MAX_INTEGER]
 
 
 def test_deep_toml_lists_are_a_value_error() -> None:
