@@ -15,12 +15,13 @@ from edge.artifacts.manifest import Artifacts
 from edge.core.geometry import SE2
 from edge.inference.generation_task import GenerationModels
 from edge.inference.graph import GraphError
-from edge.inference.language import ContextOverflowError, LanguageModel
+from edge.inference.language import ContextOverflowError
 from edge.inference.latency_profile import times_of
 from edge.inference.policy import Policy
 from edge.inference.scheduling import GiveWay, Schedule, TickActivity, enter, schedule_for
 from edge.inference.speculation import next_rows
-from edge.inference.warm_up import warm_up
+from edge.inference.start_guard import WARM_UP_S
+from edge.inference.warm_up import open_proven, warm_up
 from edge.reasoning.generation_cycle import Mode, ReasoningConfig
 from edge.run.reasoning_loop import ReasoningLoop, ReasoningOutputs, ReasoningSchedule
 from edge.state.frame import fit_frame
@@ -155,11 +156,12 @@ def measure(
     runtime = artifacts.runtime
     schedule = schedule_for(artifacts)
     activity = TickActivity(runtime.tick_period_ms * 1_000_000)
-    policy = Policy(artifacts, schedule=schedule, activity=activity)
-    language = LanguageModel(artifacts, schedule=schedule)
+    opened = open_proven(artifacts, schedule=schedule, activity=activity)
+    policy, language = opened.policy, opened.language
     language.check_instruction(instruction)
     try:
-        warm_up(policy, language, runtime.speculation)
+        with opened.guard.stage("warming up", WARM_UP_S):
+            warm_up(policy, language, runtime.speculation)
     except (GraphError, ContextOverflowError) as error:
         raise ArtifactError(f"{artifacts.directory}: the graphs do not run ({error})") from error
     slot, found = SemanticSlot(), Generations()

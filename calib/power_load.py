@@ -15,8 +15,8 @@ import numpy as np
 from calib.power_fit import Phase
 from edge.artifacts.manifest import Artifacts
 from edge.core.geometry import SE2
-from edge.inference.language import LanguageModel
-from edge.inference.policy import Policy
+from edge.inference.start_guard import WARM_UP_S
+from edge.inference.warm_up import open_proven
 from edge.power.governor.plan import STAGES
 from edge.power.meters.meter import MeterError, PowerMeter, PowerSample
 from edge.reasoning.prompt import EXAMPLE_BEFORE, EXAMPLE_PAST_PATH
@@ -112,11 +112,16 @@ class Load:
     """The stages of one artifact directory, ready for repeated runs."""
 
     def __init__(self, artifacts: Artifacts, counts: Counts) -> None:
-        """Open the graphs and run each once. Raises ArtifactError or GraphError."""
-        runtime = artifacts.runtime
-        self._runtime, self._counts = runtime, counts
-        self._policy, self._language = Policy(artifacts), LanguageModel(artifacts)
-        here = SE2(0.0, 0.0, 0.0)
+        """Open and prove the graphs and run each once. Raises ArtifactError or GraphError."""
+        self._runtime, self._counts = artifacts.runtime, counts
+        opened = open_proven(artifacts)
+        self._policy, self._language = opened.policy, opened.language
+        with opened.guard.stage("warming up", WARM_UP_S):
+            self._run_once()
+
+    def _run_once(self) -> None:
+        """Run each graph and keep its outputs as inputs of the phases."""
+        runtime, here = self._runtime, SE2(0.0, 0.0, 0.0)
         rng = np.random.default_rng(0)
         self._image = rng.integers(0, 256, (1, runtime.image_px, runtime.image_px, 3)).astype(np.uint8)
         tokens = self._policy.encode(self._image).copy()

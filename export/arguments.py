@@ -20,7 +20,7 @@ EXAMPLES = """examples:
   edge-export --target cpu --model nano --out out/nano
   edge-export --target orin --model 1b --checkpoint InternVL3-1B/ --checkpoint action.safetensors --out out/orin
   edge-export --target orin --model 1b --random-weights 0 --out out/orin
-  edge-export --target orin --model 1b --set power.mode=25W --dry-run
+  edge-export --target orin --model 1b --set power.mode=MAXN_SUPER --dry-run
   edge-export verify out/nano
   edge-export --list-targets
 
@@ -78,7 +78,7 @@ def parser() -> argparse.ArgumentParser:
         metavar="KEY=VALUE",
         action="append",
         default=[],
-        help="change the target (power.mode=25W) or the network (model.action.layers=3); repeatable",
+        help="change the target (power.mode=MAXN_SUPER) or the network (model.action.layers=3); repeatable",
     )
     p.add_argument("--out", type=Path, metavar="DIR", help="artifact directory to write")
     p.add_argument("--dry-run", action="store_true", help="print the plan and build nothing")

@@ -36,9 +36,11 @@ from export.model.config import PRESETS, ModelConfigError, TicVlaConfig
 from export.model.weights import WeightsError, save_weights
 from export.pipeline.artifacts import build_artifacts, check_replaceable, verify_directory
 from export.pipeline.build import build_stages
+from export.pipeline.early_checks import check_settings
 from export.pipeline.job import ExportRequest, Job, WeightSource, job_of
 from export.plan.plan import PlanError, plan
 from export.plan.table import plan_lines, plan_table
+from export.quantize.precision import PrecisionError
 from export.targets.file import Target, list_targets, load_target
 from export.targets.sections import TargetError
 from firmware_bridge.system.terminal import one_line
@@ -59,10 +61,11 @@ def _request(args: argparse.Namespace) -> ExportRequest:
 
 
 def _check_plan(target: Target, config: TicVlaConfig, args: argparse.Namespace) -> None:
-    """Refuse a plan that does not fit, before anything is built; with --dry-run, print the plan first."""
+    """Refuse settings or a plan that do not fit, before anything is built; with --dry-run, print the plan first."""
     try:
         made = plan(target, config)
-    except PlanError as error:
+        check_settings(target, config, made)
+    except (PlanError, PrecisionError) as error:
         raise UsageError(str(error)) from error
     if args.dry_run:
         console = Console(stderr=True)

@@ -8,6 +8,7 @@ the file.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -58,6 +59,7 @@ _QWEN2 = (
     ("use_sliding_window", (False,), False),
 )
 _ROPE_TYPES = ("default", "dynamic")
+_KINDS: Mapping[type, str] = {int: "a whole number", float: "a finite number"}
 _HF_VISION_DEFAULTS = {
     "hidden_size": 1024,
     "num_hidden_layers": 24,
@@ -106,16 +108,23 @@ class _Section:
                 raise CheckpointError(f"{self.where}{key} is {value!r}, this network implements {expected}")
 
     def number(self, key: str, kind: type[N], default: object = None) -> N:
-        """Return a number; for a [side, side] pair of a square, one of both."""
+        """Return a finite number; for a [side, side] pair of a square, one of both."""
         value = self.content.get(key, self.defaults.get(key, default))
         if isinstance(value, list) and len(value) == 2 and value[0] == value[1]:
             value = value[0]
         if kind is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
-        if not isinstance(value, kind) or isinstance(value, bool):
+        if not isinstance(value, kind) or isinstance(value, bool) or not math.isfinite(value):
             found = "not there" if value is None else repr(value)
-            raise CheckpointError(f"{self.where}{key} is {found}, expected {kind.__name__}")
+            raise CheckpointError(f"{self.where}{key} is {found}, expected {_KINDS[kind]}")
         return value
+
+    def table(self, key: str) -> Mapping[str, Any]:
+        """Return a nested table without a section of its own; an absent or null one is empty."""
+        value = self.content.get(key)
+        if value is not None and not isinstance(value, dict):
+            raise CheckpointError(f"{self.where}{key} is {value!r}, expected an object")
+        return value or {}
 
 
 def read_hf_config(directory: Path, ours: LanguageConfig) -> HfConfig:
@@ -164,10 +173,9 @@ def check_config(directory: Path, config: TicVlaConfig) -> HfConfig:
 
 def _read(top: _Section, directory: Path, ours: LanguageConfig, vision: _Section, text: _Section) -> HfConfig:
     content = text.content
-    if any(kind != "full_attention" for kind in content.get("layer_types") or ()):
-        raise CheckpointError(
-            f"{text.where}layer_types is {content['layer_types']!r}, only full_attention is implemented"
-        )
+    layer_types = content.get("layer_types") or []
+    if not isinstance(layer_types, list) or any(kind != "full_attention" for kind in layer_types):
+        raise CheckpointError(f"{text.where}layer_types is {layer_types!r}, only full_attention is implemented")
     head_dim = content.get("head_dim")
     hidden, heads = (text.number(key, int) for key in ("hidden_size", "num_attention_heads"))
     language = dataclasses.replace(
@@ -221,8 +229,8 @@ def _normalisation(directory: Path) -> tuple[tuple[float, float, float], tuple[f
 
 def _rope_theta(text: _Section, max_context: int) -> float:
     """Return the rotary angles' base; newer files have it in `rope_parameters`, older ones beside `rope_scaling`."""
-    parameters = text.content.get("rope_parameters") or {}
-    scaling = text.content.get("rope_scaling") or parameters
+    parameters = text.table("rope_parameters")
+    scaling = text.table("rope_scaling") or parameters
     kind = scaling.get("rope_type", scaling.get("type", "default"))
     if kind not in _ROPE_TYPES:
         raise CheckpointError(f"{text.where}rope_scaling of type {kind!r} is not implemented, expected {_ROPE_TYPES}")

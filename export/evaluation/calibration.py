@@ -19,7 +19,7 @@ import numpy.typing as npt
 from edge.core.geometry import SE2
 from edge.reasoning.prompt import InstructionError, check_instruction
 from export.core.typed import FieldError, build
-from firmware_bridge.system.input_file import parse_toml
+from firmware_bridge.system.input_file import open_regular, parse_toml
 
 Picture = npt.NDArray[np.uint8]
 
@@ -176,7 +176,10 @@ def _hash(contents: dict[str, bytes]) -> str:
 
 
 def _decode(data: bytes, where: str) -> Picture:
-    bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    try:
+        bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    except cv2.error:  # a size beyond OpenCV's limit, or more memory than there is
+        bgr = None
     if bgr is None:
         raise CalibrationError(f"{where} is not a readable image")
     return _rgb(bgr)
@@ -235,7 +238,7 @@ def _load_video(name: str, path: Path) -> CalibrationSet:
     where = f"calibration video {path}"
     digest = hashlib.sha256()
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:  # a FIFO would wait and /dev/zero never end
             while block := file.read(1 << 20):
                 digest.update(block)
     except OSError as error:

@@ -22,7 +22,12 @@ from export.model.config import TicVlaConfig
 from export.pipeline.build import Pipeline
 from export.pipeline.job import Job
 from export.pipeline.report import report_html
-from export.pipeline.self_test import SELF_TEST_STAGE, known_answers, repeat_self_test
+from export.pipeline.self_test import (
+    SELF_TEST_STAGE,
+    known_answers,
+    recorded_and_expected_limits,
+    repeat_self_test,
+)
 from export.plan.plan import Plan, plan
 from export.targets.file import Target
 from firmware_bridge.system.input_file import read_json
@@ -31,6 +36,8 @@ from reporting.progress import BuildProgress
 REPORT_JSON, REPORT_HTML, TOKENIZER_NAME = "report.json", "report.html", "tokenizer.json"
 NEW, OLD = "new", "old"
 RUNNER_KEYS = ("control_cores", "reasoning_cores", "control_priority", "decoding", "recovery", "speculation")
+TARGET_SECTIONS = ("name", "arch", "device", "power", "runtime", "gates")
+"""Keys of `provenance.target` that the runner, `edge-doctor` or `verify` reads."""
 SHOWN_CHARACTERS = 60
 OLDER_SCHEMAS = (1, 2, 3)
 """Manifest schemas whose directories an export may replace."""
@@ -240,19 +247,20 @@ def check_directory(pipeline: Pipeline, directory: Path, progress: BuildProgress
 
 
 def verify_directory(job: Job, directory: Path, cache: StageCache, progress: BuildProgress) -> dict[str, Any]:
-    """Check hashes, contract and gates of an existing directory again. Raises ArtifactError or GateError."""
+    """Check hashes, contract, self-test and gates of an existing directory again. Raises ArtifactError or GateError."""
     manifest = read_manifest(directory)
     pipeline = Pipeline(job, cache, progress, run_gates=True)
     weights = pipeline.weights()
     if weights.sha256 != manifest["provenance"].get("weights_sha256"):
         raise ArtifactError(f"{directory}: built from other weights than {weights.origin}; pass --checkpoint")
     _check_manifest(pipeline, directory, manifest)
+    # Before the gates: only the self-test ends a graph that loops or allocates without end.
+    with progress.stage(SELF_TEST_STAGE):
+        progress.log(f"self-test: {repeat_self_test(load_artifacts(directory))}")
     pipeline.task_reference()
     for name in job.target.graph_names:
         pipeline.reference(name)
     results = check_directory(pipeline, directory, progress)
-    with progress.stage(SELF_TEST_STAGE):
-        progress.log(f"self-test: {repeat_self_test(load_artifacts(directory))}")
     return {**manifest, "graphs": {n: {**g, "parity": results[n].to_dict()} for n, g in manifest["graphs"].items()}}
 
 
@@ -267,16 +275,21 @@ def _model_section(pipeline: Pipeline) -> dict[str, Any]:
 
 
 def _check_manifest(pipeline: Pipeline, directory: Path, manifest: Mapping[str, Any]) -> None:
-    """Check that all values that a runner reads equal this export's. Raises ArtifactError that names the first key."""
-    job, graphs = pipeline.job, manifest["graphs"]
+    """Check that all values that a runner reads equal this export's. Raises ArtifactError that names the first key.
+
+    The answers of the self-test are left to the self-test itself, the inputs and outputs of graphs to the loader.
+    """
+    job, graphs, made = pipeline.job, manifest["graphs"], _plan(pipeline)
+    target = job.target.to_dict()
     expected: dict[str, Any] = {
         "target": job.target.name,
         "model": _model_section(pipeline),
-        "runtime": manifest_runtime(job.target, job.config, _plan(pipeline)),
-        "gates": job.target.to_dict()["gates"],
+        "runtime": manifest_runtime(job.target, job.config, made),
+        "provenance.target": {key: target[key] for key in TARGET_SECTIONS},
+        "plan": made.to_dict(),
     }
-    found = {key: manifest[key] for key in ("target", "model", "runtime")}
-    found["gates"] = manifest["provenance"]["target"]["gates"]
+    found = {key: manifest[key] for key in ("target", "model", "runtime", "plan")}
+    found["provenance.target"] = {key: manifest["provenance"]["target"][key] for key in TARGET_SECTIONS}
     for name in job.target.graph_names:
         expected[f"graphs.{name}"] = {
             "precision": pipeline.precision(name)[0].to_dict(),
@@ -284,6 +297,11 @@ def _check_manifest(pipeline: Pipeline, directory: Path, manifest: Mapping[str, 
             "session": job.target.session(name, graphs[name]["inputs"]),
         }
         found[f"graphs.{name}"] = {key: graphs[name].get(key) for key in ("precision", "form", "session")}
+    if manifest["self_test"]:  # the self-test itself refuses a manifest without answers
+        made_of = {"plan": expected["plan"], "graphs": {name: expected[f"graphs.{name}"] for name in graphs}}
+        found["self_test"], expected["self_test"] = recorded_and_expected_limits(
+            manifest["self_test"], made_of, half=job.target.half
+        )
     for key, value in expected.items():
         difference = _difference(found[key], json.loads(json.dumps(value)), key)
         if difference is not None:

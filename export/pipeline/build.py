@@ -108,17 +108,17 @@ def machine_name() -> str:
 
 
 def build_stages(job: Job, known_s: Mapping[str, float], *, graphs: bool = True) -> list[Stage]:
-    """List the stages in order with their last or usual duration, s; without graph stages unless `graphs`."""
+    """List the stages in order with their last or usual duration, s; those of `verify` unless `graphs`."""
     column, order = int(is_large(job.config)), job.target.graph_names
     searched = [graph for graph in order if len(job.target.graphs[graph].candidates) > 1]
-    names = ["weights", "task reference", *(f"reference {graph}" for graph in order)]
+    names = ["weights", *([] if graphs else ["self-test"]), "task reference", *(f"reference {g}" for g in order)]
     names += [f"precision {graph}" for graph in searched]
     if graphs:
         vision = job.target.graphs["vision_encoder"]
         if vision.form == "plain" and "int8" in (vision.precision, *vision.candidates):
             names += ["activation ranges"]
         names += [f"graph {graph}" for graph in order]
-    names += [*(f"gate {graph}" for graph in order), "self-test", *(["plan and report"] if graphs else [])]
+    names += [*(f"gate {graph}" for graph in order), *(["self-test", "plan and report"] if graphs else [])]
     usual = {name: next(EXPECTED_S[kind][column] for kind in EXPECTED_S if name.startswith(kind)) for name in names}
     return [Stage(name, known_s.get(name, usual[name])) for name in names]
 

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 from edge.artifacts.known_answers import CHAIN, LIMITS_S, KnownAnswers
 from edge.artifacts.manifest import Artifacts
 from edge.artifacts.target_facts import plan_facts
-from edge.inference.graph import CPU_PROVIDER
+from edge.core.cli import EXIT_CHECK_FAILED
+from edge.inference.graph import CPU_PROVIDER, GraphError, Interrupt
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
-from edge.inference.self_test import SelfTestResult, check_answers, compute_answers
+from edge.inference.self_test import SelfTestError, SelfTestResult, check_answers, compute_answers
+from edge.inference.start_guard import OPEN_S, StartGuard
 from export.evaluation.gates import gate_provider
 from export.quantize.precision import bits
 
@@ -33,38 +37,89 @@ SLOWER: Final = 20.0
 LEAST_LIMIT_S: Final = 30.0
 
 
+@dataclass(frozen=True)
+class SelfTestLimits:
+    """Limits of a robot's self-test, which follow from the plan and from the precisions of the graphs."""
+
+    limit_s: float
+    same_tokens: float
+    tolerances: Mapping[str, float]
+    """By graph, and CHAIN."""
+
+
+def self_test_limits(manifest: Mapping[str, Any], *, half: bool, replaced: bool) -> SelfTestLimits:
+    """Return the limits that a manifest's `graphs` and `plan` give.
+
+    `half`: whether activations and KV buffers are fp16. `replaced`: whether the answers were computed on another
+    provider than the one that ships.
+    """
+    tolerances = {
+        name: max(_tolerance(graph, half=half), ROUNDED if replaced else 0.0)
+        for name, graph in manifest["graphs"].items()
+    }
+    worst = max(tolerances.values())
+    plan = plan_facts(manifest)
+    planned_s = 0.0 if plan is None else (plan.tick_alone_ms + float(manifest["plan"]["generation_alone_ms"])) / 1e3
+    return SelfTestLimits(
+        limit_s=round(min(max(LEAST_LIMIT_S, SLOWER * planned_s), LIMITS_S[1]), 1),
+        same_tokens=SAME_TOKENS[worst],
+        tolerances={**tolerances, CHAIN: CHAIN_FACTOR * worst},
+    )
+
+
 def known_answers(artifacts: Artifacts, manifest: Mapping[str, Any], *, half: bool) -> KnownAnswers:
     """Compute the answers of a directory's graphs; raises SelfTestError or GraphError.
 
     `half`: whether activations and KV buffers are fp16.
     """
-    tolerances = {
-        name: max(_tolerance(graph, half=half), ROUNDED if _replaced(artifacts) else 0.0)
-        for name, graph in manifest["graphs"].items()
-    }
-    worst = max(tolerances.values())
-    tolerances[CHAIN] = CHAIN_FACTOR * worst
-    prompt, answers = compute_answers(*_opened(artifacts), SEED, tolerances)
-    plan = plan_facts(manifest)
-    planned_s = 0.0 if plan is None else (plan.tick_alone_ms + float(manifest["plan"]["generation_alone_ms"])) / 1e3
+    limits = self_test_limits(manifest, half=half, replaced=_replaced(artifacts))
+    prompt, answers = compute_answers(*_opened(artifacts), SEED, limits.tolerances)
     return KnownAnswers(
-        seed=SEED,
-        limit_s=round(min(max(LEAST_LIMIT_S, SLOWER * planned_s), LIMITS_S[1]), 1),
-        prompt=prompt,
-        same_tokens=SAME_TOKENS[worst],
-        answers=answers,
+        seed=SEED, limit_s=limits.limit_s, prompt=prompt, same_tokens=limits.same_tokens, answers=answers
     )
 
 
+def recorded_and_expected_limits(
+    recorded: Mapping[str, Any], manifest: Mapping[str, Any], *, half: bool
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the limits in `recorded`, a manifest's `self_test`, and those that an export of `manifest` writes."""
+    answers = recorded["answers"]
+    found = SelfTestLimits(
+        recorded["limit_s"], recorded["same_tokens"], {name: answer["tolerance"] for name, answer in answers.items()}
+    )
+    accelerated = any(graph["session"]["provider"] != CPU_PROVIDER for graph in manifest["graphs"].values())
+    # The exporting computer may have lacked the accelerator's provider, which this one has.
+    both = [self_test_limits(manifest, half=half, replaced=replaced) for replaced in (False, True)]
+    expected = both[1] if accelerated and found == both[1] else both[0]
+    return asdict(found), asdict(expected)
+
+
 def repeat_self_test(artifacts: Artifacts) -> SelfTestResult:
-    """Run the robot's self-test on this machine; raises SelfTestError."""
-    return check_answers(*_opened(artifacts), artifacts.known_answers)
+    """Run the robot's self-test on this machine, with a start's limits of time and memory.
+
+    Raises ArtifactError; ends the process where a graph hangs in native code.
+    """
+    guard, known = StartGuard(artifacts, end=end_process), artifacts.known_answers
+    try:
+        with guard.stage("opening the graphs", OPEN_S):
+            opened = _opened(artifacts, guard.interrupt)
+        with guard.stage("self-test", OPEN_S if known is None else known.limit_s):
+            return check_answers(*opened, known)
+    except GraphError as error:
+        raise SelfTestError(f"{artifacts.directory}: the graphs do not run ({error}); export again") from error
 
 
-def _opened(artifacts: Artifacts) -> tuple[Policy, LanguageModel]:
+def end_process(line: str) -> None:
+    """Print one line and end the process with the exit code of a failed check: native code ends in no other way."""
+    os.write(2, f"edge-export: {line}\n".encode(errors="replace"))
+    os._exit(EXIT_CHECK_FAILED)
+
+
+def _opened(artifacts: Artifacts, interrupt: Interrupt | None = None) -> tuple[Policy, LanguageModel]:
     """Open all graphs on the providers that ship, or on the processor where one does not load here."""
     provider = CPU_PROVIDER if _replaced(artifacts) else None
-    return Policy(artifacts, provider=provider), LanguageModel(artifacts, provider=provider)
+    policy = Policy(artifacts, provider=provider, interrupt=interrupt)
+    return policy, LanguageModel(artifacts, provider=provider, interrupt=interrupt)
 
 
 def _replaced(artifacts: Artifacts) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from edge.artifacts.manifest import LANGUAGE_PAIR
+from edge.artifacts.manifest import LANGUAGE_PAIR, MOST_ROWS
 from export.model.config import TicVlaConfig
 from export.quantize.precision import Precision, weight_bytes
 
@@ -121,6 +121,7 @@ def language_call(config: TicVlaConfig, graph: str, *, tokens: int, past: int) -
     c = config.language
     attended = c.heads * c.head_dim
     kv = c.kv_heads * c.head_dim
+    scored = 0 if graph == PREFILL else min(tokens, MOST_ROWS)
     linears = [Linear("embed", c.vocab, c.hidden, tokens, table=True)]
     if graph != DECODE and c.token_merge > 1:
         linears.append(Linear("merge.1", c.hidden, config.vision.token_dim * c.token_merge**2, tokens))
@@ -134,16 +135,16 @@ def language_call(config: TicVlaConfig, graph: str, *, tokens: int, past: int) -
             Linear(f"layers.{i}.up", c.mlp, c.hidden, tokens),
             Linear(f"layers.{i}.down", c.hidden, c.mlp, tokens),
         ]
-    if graph != PREFILL:
-        # Only a call's last position is projected onto the vocabulary.
-        linears.append(Linear("lm_head", c.vocab, c.hidden, 1))
+    if scored:
+        # Only a call's last positions are projected onto the vocabulary.
+        linears.append(Linear("lm_head", c.vocab, c.hidden, scored))
     width = 6 * c.hidden + 3 * c.mlp
     return Call(
         linears=tuple(linears),
         attention_flops=2 * FLOPS_PER_PRODUCT * tokens * (past + tokens) * attended * c.layers,
         activations=2 * tokens * width * c.layers,
         cache=2 * kv * (past + 2 * tokens) * c.layers,
-        workspace=2 * tokens * width + (c.vocab if graph != PREFILL else 0),
+        workspace=2 * tokens * width + scored * c.vocab,
     )
 
 

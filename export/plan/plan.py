@@ -24,9 +24,7 @@ from edge.state.switches import Speculation
 from export.model.config import TicVlaConfig
 from export.plan.guessing import GuessingTime, guessing_time
 from export.plan.timing import (
-    GENERATION_STAGES,
     GIB,
-    TICK_STAGES,
     Estimate,
     Memory,
     StageTime,
@@ -239,14 +237,14 @@ class _Share:
     error: float | None
 
 
-def _share(target: Target, tick_alone_ms: float) -> _Share:
+def _share(target: Target, work: Work, tick_alone_ms: float) -> _Share:
     power, mode = target.power, target.power.selected
     control = tick_alone_ms / target.runtime.tick_period_ms
     one_device = target.roofline.sharing == "one-device"
     left = max(0.0, 1.0 - control) if one_device else 1.0
     # With separate cores, each thread loads its part of the processor.
     control_load, reasoning_load = (
-        (1.0, 1.0) if one_device else (_load(target, TICK_STAGES), _load(target, ("decode",)))
+        (1.0, 1.0) if one_device else (_load(target, work.tick_stages), _load(target, ("decode",)))
     )
     reasoning = left
     rise = _rise_w(target)
@@ -276,20 +274,21 @@ def _load(target: Target, stages: tuple[str, ...]) -> float:
 def _sized(
     target: Target, config: TicVlaConfig, chosen: Mapping[str, Precision], prompt: int, tokens: int, *, advise: bool
 ) -> Plan:
-    work = Work(prompt, target.runtime.prefill_chunk_tokens, tokens)
+    guidance = config.guidance_tokens if config.action.semantic_interface == "waypoints" else None
+    work = Work(prompt, target.runtime.prefill_chunk_tokens, tokens, guidance)
     stages = tuple(
         stage_time(target, config, stage, chosen[stage_graph(target, stage)], work)
-        for stage in (*TICK_STAGES, *GENERATION_STAGES)
+        for stage in (*work.tick_stages, *work.generation_stages)
     )
     by_name = {stage.stage: stage for stage in stages}
-    tick_alone = total([by_name[name].whole for name in TICK_STAGES])
-    generation_alone = total([by_name[name].whole for name in GENERATION_STAGES])
+    tick_alone = total([by_name[name].whole for name in work.tick_stages])
+    generation_alone = total([by_name[name].whole for name in work.generation_stages])
     roofline = target.roofline
     tick = tick_alone.times(1.0, roofline.tick_slowdown)
     if roofline.sharing == "one-device":
-        longest = max((by_name[name] for name in GENERATION_STAGES), key=lambda stage: stage.each.ms)
+        longest = max((by_name[name] for name in work.generation_stages), key=lambda stage: stage.each.ms)
         tick = total([tick, longest.each])
-    share = _share(target, tick_alone.ms)
+    share = _share(target, work, tick_alone.ms)
     slowed = generation_alone.times(1.0, roofline.generation_slowdown)
     generation, delay_s, duty = None, None, 0.0
     if share.reasoning > 0:
@@ -299,7 +298,7 @@ def _sized(
     guessing = None
     if tokens > 0 and target.runtime.speculation == Speculation.ON.value:
         precision = chosen[stage_graph(target, "decode")]
-        others = [by_name[name].whole for name in GENERATION_STAGES if name != "decode"]
+        others = [by_name[name].whole for name in work.generation_stages if name != "decode"]
         guessing = guessing_time(target, config, precision, work, by_name["decode"], others)
     weights = {name: graph_weights(target, config, name, chosen[name], work) for name in target.graph_names}
     made = Plan(
@@ -341,7 +340,7 @@ def _reasons(target: Target, made: Plan, share: _Share) -> list[str]:
     reasons: list[str] = []
     period = made.period_ms
     if made.tick.ms > period:
-        heaviest = max((s for s in made.stages if s.stage in TICK_STAGES), key=lambda s: s.whole.ms)
+        heaviest = max((s for s in made.stages if s.stage in made.work.tick_stages), key=lambda s: s.whole.ms)
         rounded = -(-round(made.tick.ms) // 10) * 10
         reasons.append(
             f"tick {made.tick.ms:.0f} ms exceeds the period of {period} ms by {made.tick.ms - period:.0f} ms, "
@@ -391,7 +390,7 @@ def _modes_that_fit(
     def fits(name: str) -> bool:
         other = dataclasses.replace(target, power=dataclasses.replace(target.power, mode=name))
         made = _sized(other, config, chosen, prompt, tokens, advise=False)
-        return not _reasons(other, made, _share(other, made.tick_alone.ms))
+        return not _reasons(other, made, _share(other, made.work, made.tick_alone.ms))
 
     ranked: Mapping[str, PowerMode] = {k: v for k, v in target.power.modes.items() if k != target.power.mode}
     return [name for name in ranked if fits(name)]

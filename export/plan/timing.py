@@ -27,6 +27,7 @@ from export.targets.sections import KV_DTYPES, MEASURED, MODELLED, Figure, Measu
 GIB = 1 << 30
 TICK_STAGES = ("vision_encoder", "action_expert")
 GENERATION_STAGES = ("prefill", "decode", "semantic_context")
+"""Stages of a model that is guided by keys and values; those of any model are in `Work`."""
 SAME_LENGTH = 0.05
 """Largest relative difference in length at which a measurement is used directly; beyond it, it scales the model."""
 
@@ -89,6 +90,9 @@ class Work:
     prompt_tokens: int
     chunk_tokens: int
     new_tokens: int
+    guidance_tokens: int | None = None
+    """Tokens of a semantic context of waypoints, which every tick computes; None: it is computed from K and V of the
+    prompt and the new tokens, once per generation."""
 
     @property
     def chunks(self) -> list[tuple[int, int]]:
@@ -98,8 +102,18 @@ class Work:
 
     @property
     def context_tokens(self) -> int:
-        """Tokens of the semantic state."""
-        return self.prompt_tokens + self.new_tokens
+        """Tokens of the semantic context."""
+        return self.prompt_tokens + self.new_tokens if self.guidance_tokens is None else self.guidance_tokens
+
+    @property
+    def tick_stages(self) -> tuple[str, ...]:
+        """Stages of every tick."""
+        return TICK_STAGES if self.guidance_tokens is None else (*TICK_STAGES, "semantic_context")
+
+    @property
+    def generation_stages(self) -> tuple[str, ...]:
+        """Stages of a generation."""
+        return tuple(stage for stage in GENERATION_STAGES if stage not in self.tick_stages)
 
 
 def stage_graph(target: Target, stage: str) -> str:

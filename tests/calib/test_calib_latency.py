@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import threading
 from pathlib import Path
@@ -12,7 +13,8 @@ import pytest
 from calib.cli import main
 from calib.latency import LEAST
 from calib.latency_load import WARM, Decoding, Measured, MeasureError, measure
-from edge.artifacts.manifest import load_artifacts
+from edge.artifacts.files import ArtifactError
+from edge.artifacts.manifest import Artifacts
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE
 from edge.flightlog.recorder import Recorder
 from edge.inference.latency_profile import LatencyError, LatencyProfile, load_profile, times_of
@@ -108,9 +110,9 @@ def test_invalid_arguments_are_refused_in_one_line(
     assert message in error and error.count("\n") == 1 and not list(tmp_path.iterdir())
 
 
-def measured(artifacts_dir: Path, *, mode: Mode = Mode.ASYNC, generations: int = 2, seconds: float = 60.0) -> Measured:
+def measured(artifacts: Artifacts, *, mode: Mode = Mode.ASYNC, generations: int = 2, seconds: float = 60.0) -> Measured:
     return measure(
-        load_artifacts(artifacts_dir),
+        artifacts,
         load_calibration("corridor-go2").clips[0],
         instruction=INSTRUCTION,
         mode=mode,
@@ -122,8 +124,8 @@ def measured(artifacts_dir: Path, *, mode: Mode = Mode.ASYNC, generations: int =
 
 
 @pytest.mark.slow
-def test_generations_run_beside_ticks_and_the_first_generations_are_left_out(artifacts_dir: Path) -> None:
-    found = measured(artifacts_dir)
+def test_generations_run_beside_ticks_and_the_first_generations_are_left_out(artifacts: Artifacts) -> None:
+    found = measured(artifacts)
     assert len(found.times_s) >= 2 and found.failed == 0
     assert all(0 <= anchor_s < total_s < 60 for total_s, anchor_s in found.times_s)
     # Ticks went on all the while: ten a second, were it not for a busy machine.
@@ -134,8 +136,8 @@ def test_generations_run_beside_ticks_and_the_first_generations_are_left_out(art
 
 
 @pytest.mark.slow
-def test_a_measurement_ends_after_its_time_with_what_there_is(artifacts_dir: Path) -> None:
-    found = measured(artifacts_dir, mode=Mode.NO_REASONING, generations=10_000, seconds=0.5)
+def test_a_measurement_ends_after_its_time_with_what_there_is(artifacts: Artifacts) -> None:
+    found = measured(artifacts, mode=Mode.NO_REASONING, generations=10_000, seconds=0.5)
     assert len(found.times_s) < 10_000
 
 
@@ -149,10 +151,15 @@ def test_without_calls_after_the_first_token_no_duration_of_a_call_is_known() ->
     assert Measured(((1.0, 0.0),), 9, 0, 0, (Decoding(0.0, (1,)),), {2: 1.0}).call_s == ()
 
 
-def test_a_control_thread_that_dies_ends_the_measurement(artifacts_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_graphs_that_the_self_test_has_not_proven_are_not_measured(artifacts: Artifacts) -> None:
+    with pytest.raises(ArtifactError, match="no known answers for the self-test"):
+        measured(dataclasses.replace(artifacts, known_answers=None))
+
+
+def test_a_control_thread_that_dies_ends_the_measurement(artifacts: Artifacts, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise ValueError("no picture")
 
     monkeypatch.setattr("calib.latency_load.TokenRing.put", fail)
     with pytest.raises(MeasureError, match="no picture"):
-        measured(artifacts_dir)
+        measured(artifacts)

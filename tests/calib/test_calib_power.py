@@ -18,8 +18,8 @@ import pytest
 
 from calib.power import add_arguments, measured_target, run, stage_ms, target_text
 from calib.power_fit import FitError, Phase, fit_energy, non_negative
-from calib.power_load import EnergyLog
-from edge.artifacts.files import MANIFEST_NAME, read_manifest, seal
+from calib.power_load import Counts, EnergyLog, Load
+from edge.artifacts.files import MANIFEST_NAME, ArtifactError, read_manifest, seal
 from edge.artifacts.manifest import Artifacts
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_REFUSED
 from edge.power.governor.plan import STAGES, power_plan
@@ -197,6 +197,11 @@ def test_wrong_arguments_are_refused_in_one_line(
 def test_a_directory_that_is_not_one_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(options("--artifacts", str(tmp_path / "none"))) == EXIT_BAD_INPUT
     assert "not a directory" in capsys.readouterr().err
+
+
+def test_graphs_that_the_self_test_has_not_proven_are_not_measured(artifacts: Artifacts) -> None:
+    with pytest.raises(ArtifactError, match="no known answers for the self-test"):
+        Load(dataclasses.replace(artifacts, known_answers=None), Counts())
 
 
 def with_energies(artifacts_dir: Path, folder: Path) -> Path:

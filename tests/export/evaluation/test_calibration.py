@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -149,6 +152,14 @@ def test_an_unreadable_source_is_refused_in_one_line(tmp_path: Path, kind: str) 
         load_calibration(f"{kind}:{tmp_path / 'nothing'}")
 
 
+@pytest.mark.parametrize("name", ["/dev/zero", "fifo", "folder"])
+def test_a_video_that_is_no_regular_file_is_refused_at_once(tmp_path: Path, name: str) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(CalibrationError, match=r"cannot be read \(is (a directory|not a regular file)"):
+        load_calibration(f"video:{tmp_path / name}")
+
+
 @pytest.mark.parametrize(("name", "line"), [("empty.avi", "not a readable video"), ("short.avi", "at least 21 are")])
 def test_a_video_that_is_broken_or_too_short_is_refused(tmp_path: Path, name: str, line: str) -> None:
     (tmp_path / "empty.avi").write_bytes(b"")
@@ -166,5 +177,22 @@ def test_a_folder_with_too_few_images_is_refused(tmp_path: Path, count: int) -> 
 def test_an_unreadable_image_in_a_folder_is_named(tmp_path: Path) -> None:
     folder = _folder(tmp_path / "mine")
     (folder / "005.png").write_bytes(b"\x89PNG")
+    with pytest.raises(CalibrationError, match=r"005\.png is not a readable image"):
+        load_calibration(f"folder:{folder}")
+
+
+def _png(width: int, height: int) -> bytes:
+    """A PNG of that size in its header, without pixels."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(b"")) + chunk(b"IEND", b"")
+
+
+def test_an_image_larger_than_opencv_accepts_is_named(tmp_path: Path) -> None:
+    folder = _folder(tmp_path / "mine")
+    (folder / "005.png").write_bytes(_png(100_000, 100_000))
     with pytest.raises(CalibrationError, match=r"005\.png is not a readable image"):
         load_calibration(f"folder:{folder}")

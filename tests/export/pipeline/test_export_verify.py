@@ -4,21 +4,73 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from edge.artifacts.files import seal
+from edge.artifacts.manifest import Artifacts
+from edge.core.cli import EXIT_CHECK_FAILED
+from edge.inference.self_test import SelfTestError
+from edge.inference.start_guard import StartGuard
 from export.cli import main
 from export.core.cache import file_sha256
 from export.pipeline import job
+from export.pipeline.self_test import recorded_and_expected_limits, self_test_limits
 from export.targets.file import TARGETS_DIR
+from tests.edge.inference.test_self_test import loop_for_ever
 from tests.support.export.export_job import manifest
 
 
 def test_verify_repeats_the_gate(artifacts_dir: Path) -> None:
     assert main(["verify", str(artifacts_dir)]) == 0
+
+
+def test_verify_runs_the_limited_self_test_before_any_gate(
+    artifacts_dir: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_artifacts: Artifacts) -> None:
+        raise SelfTestError("the self-test came first")
+
+    monkeypatch.setattr("export.pipeline.artifacts.repeat_self_test", refuse)
+    monkeypatch.setattr("export.pipeline.artifacts.check_directory", lambda *_: pytest.fail("a gate came first"))
+    assert main(["verify", str(artifacts_dir)]) == 1
+    assert "the self-test came first" in capsys.readouterr().err
+
+
+class Impatient(StartGuard):
+    """Ends a self-test after 1.5 s, and never the process."""
+
+    def __init__(self, artifacts: Artifacts, **_: object) -> None:
+        super().__init__(artifacts, end=lambda _line: None)
+
+    @contextmanager
+    def stage(self, what: str, limit_s: float) -> Iterator[None]:
+        with super().stage(what, 1.5 if what == "self-test" else limit_s):
+            yield
+
+
+@pytest.mark.slow
+def test_a_graph_that_loops_does_not_hang_verify(
+    artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copy = Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))
+    loop_for_ever(copy)
+    monkeypatch.setattr("export.pipeline.self_test.StartGuard", Impatient)
+    assert main(["verify", str(copy)]) == 1
+    assert "self-test: not done after its limit of 1.5 s" in capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.slow
+def test_a_call_that_hangs_ends_verify_with_one_line_and_the_exit_code_of_a_failed_check() -> None:
+    code = "from export.pipeline.self_test import end_process; end_process('x')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=120)
+    assert (done.returncode, done.stdout, done.stderr) == (EXIT_CHECK_FAILED, "", "edge-export: x\n")
 
 
 def resealed(directory: Path, keys: str, value: object) -> Path:
@@ -37,7 +89,7 @@ def resealed(directory: Path, keys: str, value: object) -> Path:
 @pytest.mark.parametrize(
     ("keys", "value", "message"),
     [
-        ("runtime/tick_period_ms", 900, "runtime: tick_period_ms is 900, the plan's is 100"),
+        ("runtime/tick_period_ms", 120, "runtime: tick_period_ms is 120, the plan's is 100"),
         ("runtime/img_context_id", 7, "tokenizer.json: <IMG_CONTEXT> is id 5, the network was built for 7"),
         ("runtime/frame_offsets_s", [0.0, 1.0, 3.0, 6.0], "runtime.frame_offsets_s is"),
         ("runtime/max_new_tokens", 47, "runtime.max_new_tokens is 47"),
@@ -48,6 +100,14 @@ def resealed(directory: Path, keys: str, value: object) -> Path:
         ("model/config/action/step_s", 0.2, "step_s is 0.1, the network was built for 0.2"),
         ("model/config/action/layers", 5, "model.config.action.layers is 5"),
         ("provenance/target/gates/action_expert/max_abs", 9.0, "gates.action_expert.max_abs is 9.0"),
+        ("provenance/target/power/meter", "nvml", 'provenance.target.power.meter is "nvml"'),
+        ("provenance/target/runtime/enforce_plan", True, "provenance.target.runtime.enforce_plan is true"),
+        ("provenance/target/device/memory_gib", 512.0, "provenance.target.device.memory_gib is 512.0"),
+        ("plan/tick_ms", 1.0, "plan.tick_ms is 1.0"),
+        ("plan/per_graph/decode/energy_j", 5.0, "plan.per_graph.decode.energy_j is 5.0"),
+        ("self_test/limit_s", 600.0, "self_test.limit_s is 600.0"),
+        ("self_test/same_tokens", 0.1, "self_test.same_tokens is 0.1"),
+        ("self_test/answers/chain/tolerance", 0.2, "self_test.tolerances.chain is 0.2"),
     ],
 )
 def test_a_manifest_that_was_changed_and_sealed_again_does_not_verify(
@@ -57,6 +117,19 @@ def test_a_manifest_that_was_changed_and_sealed_again_does_not_verify(
     assert main(["verify", str(copy)]) == 1
     error = capsys.readouterr().err.splitlines()[-1]
     assert message in error
+
+
+@pytest.mark.parametrize(("provider", "accepted"), [("CUDAExecutionProvider", True), ("CPUExecutionProvider", False)])
+def test_tolerances_of_an_exporter_without_the_provider_are_accepted_for_an_accelerator_only(
+    provider: str, accepted: bool
+) -> None:
+    graph = {"precision": {"default": "fp32", "overrides": {}}, "session": {"provider": provider}}
+    content = {"graphs": {"vision_encoder": graph}, "plan": {}}
+    wide = self_test_limits(content, half=False, replaced=True)
+    answers = {name: {"tolerance": tolerance} for name, tolerance in wide.tolerances.items()}
+    recorded = {"limit_s": wide.limit_s, "same_tokens": wide.same_tokens, "answers": answers}
+    found, expected = recorded_and_expected_limits(recorded, content, half=False)
+    assert (found == expected) is accepted
 
 
 def test_another_tokenizer_does_not_verify_although_the_manifest_vouches_for_it(

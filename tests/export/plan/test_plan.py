@@ -8,6 +8,7 @@ import io
 import pytest
 from rich.console import Console
 
+from edge.artifacts.manifest import MOST_ROWS
 from export.graphs.build import linear_layers
 from export.model.config import PRESETS
 from export.plan.cost import DECODE, PREFILL, action_call, context_call, language_call, vision_call
@@ -175,6 +176,29 @@ def test_the_counted_layers_are_the_layers_of_the_graphs(config: object) -> None
     for graph, call in calls.items():
         counted = {linear.name for linear in call.linears if not (linear.name.startswith("embed") and graph[0] == "v")}
         assert counted == set(linear_layers(config, graph)) - ({"embed"} if graph[0] == "v" else set())
+
+
+@pytest.mark.parametrize(("tokens", "scored"), [(1, 1), (4, 4), (128, MOST_ROWS)])
+@pytest.mark.parametrize("graph", ["language_model", DECODE])
+def test_a_call_projects_its_last_positions_onto_the_vocabulary(graph: str, tokens: int, scored: int) -> None:
+    call, blind = (language_call(BIG, name, tokens=tokens, past=0) for name in (graph, PREFILL))
+    head = next(linear for linear in call.linears if linear.name == "lm_head")
+    assert head.tokens == scored
+    assert call.workspace - blind.workspace == scored * BIG.language.vocab
+
+
+@pytest.mark.parametrize("name", ["orin", "cpu"])
+def test_a_context_of_waypoints_has_three_tokens_and_belongs_to_the_tick(name: str) -> None:
+    config = dataclasses.replace(BIG, action=dataclasses.replace(BIG.action, semantic_interface="waypoints"))
+    made, by_kv = (plan(target(name), each, tokens=32) for each in (config, BIG))
+    entries = made.to_dict()["per_graph"]
+    tick, generation = ("vision_encoder", "action_expert", "semantic_context"), ("prefill", "decode")
+    assert made.tick_alone.ms == pytest.approx(sum(entries[part]["ms"] for part in tick), abs=0.01)
+    assert made.generation_alone.ms == pytest.approx(sum(entries[part]["ms"] for part in generation), abs=0.01)
+    work = {"semantic_context": context_call(config, tokens=3), "action_expert": action_call(config, context=3)}
+    for part, call in work.items():
+        assert entries[part]["gflop"] == pytest.approx(call.flops() / 1e9, abs=1e-3)
+    assert made.memory.caches < by_kv.memory.caches
 
 
 @pytest.mark.parametrize("name", ["orin", "cpu"])
