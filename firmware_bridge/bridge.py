@@ -26,6 +26,7 @@ from firmware_bridge.absent_robot import AbsentRobot
 from firmware_bridge.backends import INSTALL, backend_opener, missing_link, robot_table
 from firmware_bridge.client_link import USER_ONLY, ClientLink, SocketGroups, SocketTakenError
 from firmware_bridge.core.config import (
+    BRIDGE_PRIORITY,
     OBSERVER_SUFFIX,
     OPERATOR_SUFFIX,
     SERVICE_SOCKET,
@@ -48,6 +49,9 @@ _OBSERVERS: Final = 4
 _LOG_TIMEOUT_S: Final = 0.5
 _LAST_ZEROS: Final = 5  # ticks of zeros between a signal and the exit
 _LATE_NS: Final = 50_000_000  # a step this late is no sign of life for the watchdog
+_PAUSE_NS: Final = 1_000_000
+"""Pause after each step, ns: a client that floods a socket must not keep a bridge of real-time priority from sleeping,
+because LimitRTTIME kills it then. Far below every bound on a stop."""
 _STARTING_S: Final = 20.0  # the unit's TimeoutStartSec, which moves on while the bridge waits for its interface
 _EXTEND_NS: Final = 5_000_000_000
 _LOCK_PRESENT_FUTURE_ONCE_TOUCHED: Final = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT of <sys/mman.h>
@@ -149,6 +153,7 @@ class Bridge:
     def _wait(self, wakeup: socket.socket, wake_ns: int) -> bool:
         """Wait for input or the deadline; True when it is time to leave."""
         self._wake_ns = wake_ns
+        time.sleep(max(min(_PAUSE_NS, wake_ns - time.monotonic_ns()), 0) / 1e9)
         poller = select.poll()
         for file in (wakeup, *self._link.files(), *self._operators.files(), *self._observers.files()):
             poller.register(file, select.POLLIN)
@@ -252,6 +257,18 @@ def settle_memory() -> None:
     gc.collect()  # visits nothing; a later one begins at a quarter of the objects that this one visited
 
 
+def take_priority() -> None:
+    """Give this thread, and those that it starts, the installed service's real-time priority where that is permitted.
+
+    The runner's threads have up to one less. A higher priority stays.
+    """
+    is_real_time = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK in (os.SCHED_FIFO, os.SCHED_RR)
+    if is_real_time and os.sched_getparam(0).sched_priority >= BRIDGE_PRIORITY:
+        return
+    with contextlib.suppress(PermissionError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(BRIDGE_PRIORITY))
+
+
 def lock_memory() -> str | None:
     """Keep this process's pages in memory once touched; why not, in one line, when the system does not permit it."""
     libc = ctypes.CDLL(None, use_errno=True)
@@ -278,6 +295,7 @@ def signals_to_socket() -> Iterator[socket.socket]:
 
 def serve(config: RobotConfig, latch_path: Path, groups: SocketGroups) -> dict[str, object]:
     """Be the bridge until a signal; the JSON result. Raises what `Bridge` raises."""
+    take_priority()  # first: threads inherit it
     with signals_to_socket() as wakeup:
         log = LineLog(sys.stderr, "edge-bridge")
         notifier = Notifier(os.environ)

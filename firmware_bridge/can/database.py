@@ -5,6 +5,7 @@ All errors are ConfigError with one line that names the place in the robot file,
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -19,6 +20,7 @@ from firmware_bridge.can.traffic import planned_load
 from firmware_bridge.core.config import RobotConfig
 from firmware_bridge.core.config_can import CanConfig, CanProtection
 from firmware_bridge.core.sections import ConfigError, require
+from firmware_bridge.system.input_file import read_bytes
 
 _KINDS: Final = {
     "can.command.vx": ("speed",),
@@ -39,11 +41,19 @@ _KINDS: Final = {
     "can.uptime": ("time",),
 }
 """Kinds of quantity that a place may have; the others are integers without a unit."""
+_LARGEST: Final = {"can.uptime": 2**62 / 1e9, "can.battery.charge": 1e6}
+"""Largest values of what becomes an integer of 64 bits: the clock, s, which must not reach 2^63 ns; the charge, %."""
+_MOST_STATE_BITS: Final = 32
+_MOST: Final = 1e30
+"""Bound of every other number of a signal: far above all units, and products of two are still finite."""
 _OURS: Final = ("can.command.", "can.mode.", "can.estop.request")
+_APART: Final = ("can.command.vx", "can.mode.request", "can.estop.request", "can.heartbeat")
 _CYCLIC: Final = ("can.odometry.", "can.wheels.", "can.state.")
 _MOST_BYTES: Final = 8
 _MOST_IDENTIFIER: Final = 0x7FF
 _NS_PER_MS: Final = 1_000_000
+_MAX_DBC_BYTES: Final = 4_000_000  # our choice: a hundred times a large base's file
+_ENCODING: Final = "cp1252"  # of DBC files
 
 
 @dataclass(frozen=True)
@@ -85,7 +95,8 @@ def load_database(config: RobotConfig) -> CanDatabase:
 
 def _read(can: CanConfig) -> DbcFile:
     try:
-        loaded = cantools.database.load_file(can.dbc_path)
+        text = read_bytes(can.dbc_path, _MAX_DBC_BYTES).decode(_ENCODING, errors="replace")
+        loaded = cantools.database.load_string(text, "dbc")
     except (OSError, ValueError, cantools.Error) as error:
         line = " ".join(str(error).split())
         raise ConfigError(f"can.dbc: {can.dbc_path}: expected a DBC file, found: {line}") from error
@@ -118,6 +129,7 @@ class _Loader:
             else:
                 received[message.identifier] = message
         self._check_directions(used)
+        self._check_apart(used)
         self._check_command(signals, sent)
         self._check_values(signals)
         assigned = {where: signal for where, signal in signals.items() if signal.message in sent}
@@ -159,16 +171,19 @@ class _Loader:
         integer = not dbc.is_float and not dbc.is_multiplexer
         require(integer, f"{where}: {text}: expected an integer signal, found a float or a multiplexer")
         kind, factor = self._unit(where, text, dbc)
-        scale, offset = float(dbc.scale) * factor, float(dbc.offset) * factor
+        scale, offset = _number(dbc.scale) * factor, _number(dbc.offset) * factor
         if where not in _KINDS:
             require((scale, offset) == (1.0, 0.0), f"{where}: {text}: expected factor 1 and offset 0")
         require(scale != 0, f"{where}: {text}: expected a factor other than 0")
         least = -(1 << (dbc.length - 1)) if dbc.is_signed else 0
         ends = sorted((least * scale + offset, (least + (1 << dbc.length) - 1) * scale + offset))
+        small = all(abs(value) < _MOST for value in (scale, offset, *ends))
+        require(small, f"{where}: {text}: expected a factor, an offset and values below {_MOST:g}")
         bounds = (dbc.minimum, dbc.maximum)
         if None not in bounds and bounds != (0, 0):  # [0|0] in a DBC file means no range
             assert dbc.minimum is not None and dbc.maximum is not None
-            ends = [max(ends[0], float(dbc.minimum) * factor), min(ends[1], float(dbc.maximum) * factor)]
+            ends = [max(ends[0], _number(dbc.minimum) * factor), min(ends[1], _number(dbc.maximum) * factor)]
+        self._check_size(where, text, dbc, max(map(abs, ends)) + abs(scale) / 2)  # as far as decode() accepts
         big = dbc.byte_order == "big_endian"
         return Signal(
             message.name,
@@ -184,6 +199,14 @@ class _Loader:
             ends[1],
             kind,
         )
+
+    def _check_size(self, where: str, text: str, dbc: DbcSignal, largest: float) -> None:
+        """Refuse a signal whose values do not fit the datagram that carries them to the runner."""
+        if where in _LARGEST:
+            most = _LARGEST[where]
+            require(largest <= most, f"{where}: {text}: expected a range of at most {most:g}, found {largest:g}")
+        fits = where != "can.state.signal" or dbc.length <= _MOST_STATE_BITS
+        require(fits, f"{where}: {text}: expected at most {_MOST_STATE_BITS} bits, found {dbc.length}")
 
     def _unit(self, where: str, text: str, dbc: DbcSignal) -> tuple[str, float]:
         """Return the kind of quantity and the factor from the DBC's unit to ours."""
@@ -202,6 +225,14 @@ class _Loader:
                 expected = self._can.node if ours else "another node"
                 found = ", ".join(senders) or "nobody"
                 raise ConfigError(f"{where}: {name}: expected {expected} as its sender, found {found}")
+
+    def _check_apart(self, used: dict[str, str]) -> None:
+        """Refuse two requests in one message: each frame of one would send a value of the other, unrequested."""
+        places: dict[str, str] = {}
+        for where in _APART:
+            if where in used:
+                other = places.setdefault(used[where], where)
+                require(other == where, f"{where}: expected a message other than that of {other} ({used[where]})")
 
     def _check_command(self, signals: dict[str, Signal], sent: dict[str, Message]) -> None:
         vx, wz, limits = signals["can.command.vx"], signals["can.command.wz"], self._config.limits
@@ -222,16 +253,14 @@ class _Loader:
         patient = timeout_ms * rate_hz > 2 * 1000
         need = f"more than {2 * 1000 / rate_hz:g} (one lost command at {rate_hz} Hz must not stop the base)"
         require(patient, f"can.command.base_timeout_ms: expected {need}, found {timeout_ms}")
-        if self._can.mode is not None:
-            alone = signals["can.mode.request"].message != vx.message
-            require(alone, f"can.mode.request: expected a message other than the velocity command's ({vx.message})")
 
     def _check_values(self, signals: dict[str, Signal]) -> None:
         can, needed = self._can, []
         if can.mode is not None:
             needed += [("can.mode.request", can.mode.arm), ("can.mode.request", can.mode.disarm)]
         if can.state is not None:
-            needed += [("can.state.signal", can.state.idle), ("can.state.signal", can.state.armed)]
+            values = (can.state.idle, can.state.armed, *([can.state.estop] if can.state.estop >= 0 else []))
+            needed += [("can.state.signal", value) for value in values]
         if can.estop is not None and can.estop.request:
             needed += [("can.estop.request", value) for value in (can.estop.none, can.estop.stop, can.estop.reset)]
         for where, value in needed:
@@ -249,10 +278,11 @@ class _Loader:
             dbc = next((each for each in self._messages[name].signals if each.name == signal_name), None)
             if dbc is None:
                 raise ConfigError(f"can.constants: expected a signal of {name}, found {signal_name!r}")
-            raw = round((float(number) - float(dbc.offset)) / float(dbc.scale))
-            least = -(1 << (dbc.length - 1)) if dbc.is_signed else 0
-            fits = least <= raw < least + (1 << dbc.length)
+            scale, least = _number(dbc.scale), -(1 << (dbc.length - 1)) if dbc.is_signed else 0
+            exact = (float(number) - _number(dbc.offset)) / scale if scale else math.inf
+            fits = abs(exact) < 1 << 64 and least <= round(exact) < least + (1 << dbc.length)
             require(fits, f"can.constants: {place}: expected a value that fits {dbc.length} bits, found {number}")
+            raw = round(exact)
             bits[name] |= _in_frame(raw, self._messages[name].length, dbc)
             given.add(place)
         protection = self._can.protection
@@ -288,6 +318,14 @@ class _Loader:
         fits = load <= self._can.max_load
         require(fits, f"can.max_load: expected cyclic messages of at most {allowed}, found {load:.0%}")
         return load
+
+
+def _number(value: float) -> float:
+    """Return a number of the DBC file; one that is too large for a float becomes infinite."""
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf
 
 
 def _shift(length: int, dbc: DbcSignal) -> int:

@@ -45,19 +45,19 @@ class AgreementCheck:
 
     def check(
         self, now_ns: int, moved: tuple[float, float], commanded: tuple[float, float] | None, gyro_radps: float | None
-    ) -> int:
-        """Return the error code, 0 without one. `moved`, `commanded`: forward speed and yaw rate; None: unknown."""
+    ) -> tuple[int, ...]:
+        """Return the error codes. `moved`, `commanded`: forward speed and yaw rate; None: unknown."""
         limits, (vx, wz) = self._limits, moved
         follows = commanded is None or not (
             self._differs(vx, commanded[0], limits.vx_mps) or self._differs(wz, commanded[1], limits.wz_radps)
         )
         turns = gyro_radps is None or not self._differs(wz, gyro_radps, limits.wz_radps)
-        found = 0
-        for code, agrees, most_s in ((ERROR_GYRO, turns, limits.gyro_s), (ERROR_COMMAND, follows, limits.command_s)):
+        found: tuple[int, ...] = ()
+        for code, agrees, most_s in ((ERROR_COMMAND, follows, limits.command_s), (ERROR_GYRO, turns, limits.gyro_s)):
             since_ns = now_ns if agrees else self._agreed_ns.get(code, now_ns)
             self._agreed_ns[code] = since_ns
             if now_ns - since_ns > most_s * 1e9:
-                found = code
+                found += (code,)
         return found
 
     def _differs(self, found: float, expected: float, constant: float) -> bool:

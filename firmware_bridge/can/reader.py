@@ -6,6 +6,7 @@ length, CRC and counter are right; a value outside its signal's range in the DBC
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Final
 
@@ -17,7 +18,7 @@ from firmware_bridge.can.protection import Checker, Verdict
 from firmware_bridge.can.table import MODE_WITHOUT_STATE
 from firmware_bridge.can.traffic import TrafficWatch
 from firmware_bridge.core.config_can import CanConfig
-from firmware_bridge.core.robot_state import BatteryState, RobotState, StampOrder
+from firmware_bridge.core.robot_state import BatteryState, RobotState, StampOrder, reported_code
 from firmware_bridge.core.step_types import Report
 
 _LEAST_MISSING_NS: Final = 200_000_000
@@ -98,8 +99,9 @@ class _BaseClock:
 class BaseReader:
     """Decoder of one base: `put` frames in, `take` one report a step."""
 
-    def __init__(self, config: CanConfig, database: CanDatabase, now_ns: int) -> None:
-        self._config, self._database = config, database
+    def __init__(self, config: CanConfig, database: CanDatabase, now_ns: int, accepted: Collection[int]) -> None:
+        """`accepted`: error codes of the robot file that hide no other one."""
+        self._config, self._database, self._accepted = config, database, accepted
         self.health, self.counts = BusHealth(), Counts()
         self.traffic = TrafficWatch(config.bitrate_bps, now_ns)
         received = database.received.items()
@@ -241,7 +243,7 @@ class BaseReader:
         pose, vx, wz = motion
         armed = self._config.state is None or mode == self._config.state.armed
         commanded = self._command if armed and now_ns - self._command_ns <= _COMMANDED_NS else None
-        code = self._agreement.check(now_ns, (vx, wz), commanded, gyro)
+        codes = (*self._faults(), *self._agreement.check(now_ns, (vx, wz), commanded, gyro))
         return RobotState(
             received_ns=now_ns,
             T_odom_base=pose,
@@ -249,7 +251,7 @@ class BaseReader:
             vy_mps=0.0,
             wz_radps=wz,
             mode=mode,
-            error_code=self._fault() or code,
+            error_code=reported_code(codes, self._accepted),
             robot_stamp_ns=self._clock.stamp_ns,
             position_z_m=0.0,
             roll_rad=roll or 0.0,
@@ -292,12 +294,9 @@ class BaseReader:
     def _mode(self) -> int | None:
         return MODE_WITHOUT_STATE if self._config.state is None else self._raw("can.state.signal")
 
-    def _fault(self) -> int:
-        """Return the error code of the first fault signal that is set, 0 without one."""
-        for index in range(len(self._config.faults)):
-            if self._raw(f"can.faults[{index}]"):
-                return ERROR_FAULTS + index
-        return 0
+    def _faults(self) -> list[int]:
+        """Return the error codes of the fault signals that are set."""
+        return [ERROR_FAULTS + index for index in range(len(self._config.faults)) if self._raw(f"can.faults[{index}]")]
 
     def _emergency_stop(self) -> bool:
         """Return whether the base's button is pressed, or its emergency stop has latched since the last step.

@@ -39,7 +39,8 @@ class RobotLink:
         self._database = load_database(config)
         self._address = BusAddress(self._can.interface, self._can.channel)
         self._now_ns = time.monotonic_ns()
-        self._reader = BaseReader(self._can, self._database, self._now_ns)
+        accepted = config.safety.accepted_error_codes
+        self._reader = BaseReader(self._can, self._database, self._now_ns, accepted)
         self._sender = FrameSender(self._database)
         self._bus: FrameBus | None = self._opened()
         self._reopen_ns = self._refused_ns = 0

@@ -153,7 +153,7 @@ def load_robot_config(path: Path | str, *, socket: Path | None = None, domain: i
         raise ConfigError(f"robot file {path}: cannot be read: {reason}") from error
     try:
         safety = table.get("safety")
-        if table.get("protocol") in LINKS and table["protocol"] != "unitree" and isinstance(safety, dict):
+        if _protocol_of(table) not in (None, "unitree") and isinstance(safety, dict):
             for key in UNITREE_SAFETY:
                 require(key not in safety, f"unknown key safety.{key}: only protocol unitree has it")
         table, published = _split_ros2(table)
@@ -166,13 +166,19 @@ def load_robot_config(path: Path | str, *, socket: Path | None = None, domain: i
         raise ConfigError(f"robot file {path}: {error}") from error
 
 
+def _protocol_of(table: dict[str, Any]) -> str | None:
+    """Return the protocol of a robot file's table; None where it is none of LINKS."""
+    protocol = table.get("protocol")
+    return protocol if isinstance(protocol, str) and protocol in LINKS else None
+
+
 def _split_ros2(table: dict[str, Any]) -> tuple[dict[str, Any], Ros2PublishConfig]:
     """Take the keys of [ros2] that every protocol may have out of a robot file's table."""
-    ros2, protocol = table.get("ros2"), table.get("protocol")
+    ros2, protocol = table.get("ros2"), _protocol_of(table)
     if not isinstance(ros2, dict):
         return table, Ros2PublishConfig()
     rest, published = Ros2PublishConfig.split(ros2)
-    if protocol in LINKS and "ros2" not in LINKS[protocol]:
+    if protocol is not None and "ros2" not in LINKS[protocol]:
         for key in rest:
             raise ConfigError(f"unknown key ros2.{key}: protocol {protocol} has only ros2.publish and ros2.publish_*")
         table = {key: value for key, value in table.items() if key != "ros2"}

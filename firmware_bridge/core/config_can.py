@@ -6,6 +6,7 @@ file only; `firmware_bridge/can/database.py` checks these tables against it when
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import ClassVar, Final
@@ -17,6 +18,8 @@ ROBOT_FILES: Final = Path(__file__).parents[1] / "robots"
 """Folder of the shipped robot files and DBC files."""
 CRC_INPUTS: Final = ("id_low", "id_high", "length", "data")
 """Parts of a frame that a CRC may cover; `data` are all its bytes but those of the CRC."""
+_NUMBER: Final = r"-?([0-9]{1,20}(\.[0-9]{0,20})?|\.[0-9]{1,20})"
+"""Number in `can.constants`; 20 digits are those of 64 bits."""
 
 
 class CanTable(Section):
@@ -248,13 +251,17 @@ class CanConfig(Section):
         )
         told = self.mode is None or self.state is not None
         require(told, "missing table [can.state]: [can.mode] needs the state that shows the request's effect")
+        resets = self.estop is not None and self.estop.latched != "" and self.estop.request != ""
+        seen = self.state is not None and self.state.estop >= 0
+        need = "can.estop with latched and request needs the state in which an arming sends the reset"
+        require(seen or not resets, f"missing key can.state.estop: {need}")
         for text in (self.uptime, *self.faults, *(text.partition("=")[0] for text in self.constants)):
             parts = text.split(".")
             valid = text == "" or (len(parts) == 2 and all(parts))
             require(valid, f'can.uptime, faults, constants: expected "MESSAGE.SIGNAL", found {text!r}')
         for text in self.constants:
             number = text.partition("=")[2]
-            valid = number.lstrip("-").isascii() and number.lstrip("-").replace(".", "", 1).isdecimal()
+            valid = re.fullmatch(_NUMBER, number) is not None
             require(valid, f'can.constants: expected "MESSAGE.SIGNAL=NUMBER", found {text!r}')
         if self.interface == "serial" and not Path(self.channel).is_absolute():
             object.__setattr__(self, "channel", str(runtime_dir() / self.channel))

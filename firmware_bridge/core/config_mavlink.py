@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Final
 
@@ -11,6 +12,7 @@ from firmware_bridge.core.sections import Section, require, within_range
 AUTOPILOTS: Final = ("px4", "ardupilot")
 BAUDS: Final = (57600, 115200, 230400, 460800, 500000, 921600, 1000000, 1500000, 2000000)
 """Line speeds that carry the rover's reports and that termios(3) knows; 57600 leaves no room for a second program."""
+_MAX_DIGITS: Final = 7  # of a port and a line speed
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,9 @@ class MavlinkConfig(Section):
         super().__post_init__()
         kind, _, rest = self.link.partition(":")
         place, _, number = rest.rpartition(":")
-        form = kind in ("udp", "serial") and place != "" and number.isascii() and number.isdecimal()
+        # int() raises an error for more than 4300 digits.
+        valid = number.isascii() and number.isdecimal() and len(number) <= _MAX_DIGITS
+        form = kind in ("udp", "serial") and place != "" and valid
         require(form, f"mavlink.link: expected udp:HOST:PORT or serial:PATH:BAUD, found {self.link!r}")
         if kind == "udp":
             fits = _is_ipv4(place) and 1 <= int(number) <= 65535
@@ -72,5 +76,8 @@ class MavlinkConfig(Section):
 
 def _is_ipv4(text: str) -> bool:
     """Whether `text` is four decimal numbers; a name would need a resolver, which may wait."""
-    parts = text.split(".")
-    return len(parts) == 4 and all(part.isascii() and part.isdecimal() and int(part) <= 255 for part in parts)
+    try:
+        IPv4Address(text)
+    except ValueError:
+        return False
+    return True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -59,6 +60,11 @@ class BatteryState:
 def within(bound: float, *values: float) -> bool:
     """Whether every value is finite and at most `bound` in size."""
     return all(abs(value) <= bound for value in values)  # False for NaN
+
+
+def reported_code(codes: Sequence[int], accepted: Collection[int]) -> int:
+    """Return the first error code that is not accepted, so that an accepted one hides no other; 0 without any code."""
+    return next((code for code in codes if code not in accepted), codes[0] if codes else 0)
 
 
 class StampOrder:

@@ -16,11 +16,11 @@ class Report:
 
     `remote_in_use`: a person drives the robot by its remote, or has switched it to a mode of the remote.
     `remote_estop`: the robot's own emergency stop was pressed. `taken_over`: a person has changed the mode of the robot
-    while the bridge drove it; it latches like an emergency stop. `foreign` names a motion or mode request of another
-    client. `denied` names a request of ours that the robot denied because another client holds its lease. `publishers`
-    names the input that has more than one publisher. `version` is the robot's answer to `Identify`. `writes_fail`: the
-    network has refused our last commands. `unsafe` names a property of the robot that forbids motion, such as a
-    failsafe of its own that is weaker than the bridge's.
+    while the bridge drove it, or has chosen an automatic mode; it latches like an emergency stop. `foreign` names a
+    motion or mode request of another client. `denied` names a request of ours that the robot denied because another
+    client holds its lease. `publishers` names the input that has more than one publisher. `version` is the robot's
+    answer to `Identify`. `writes_fail`: the network has refused our last commands. `unsafe` names a property of the
+    robot that forbids motion, such as a failsafe of its own that is weaker than the bridge's.
     """
 
     state: RobotState | None = None

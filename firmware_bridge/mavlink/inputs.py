@@ -21,7 +21,7 @@ MAX_VOLTAGE_V: Final = 1000.0
 MAX_CURRENT_A: Final = 1000.0
 _MAX_ANGLE_RAD: Final = 2 * math.pi
 _NORM_TOLERANCE: Final = 0.05
-_FRAMES: Final = (1, 20)  # MAV_FRAME_LOCAL_NED, MAV_FRAME_LOCAL_FRD
+_FRAMES: Final = (1, 20)  # MAV_FRAME_LOCAL_NED, MAV_FRAME_LOCAL_FRD; PX4 reports the velocity in them too
 _BODY_FRAMES: Final = (8, 12)  # MAV_FRAME_BODY_NED in older firmware, MAV_FRAME_BODY_FRD
 _FAILED_QUALITY: Final = -1
 _NO_VOLTAGE: Final = 65535
@@ -62,20 +62,27 @@ class Attitude:
 
 
 def motion_of_odometry(message: Message) -> Motion | None:
-    """Convert an ODOMETRY; None when a field cannot be true, for other frames, and for an estimator that has failed."""
-    w, x, y, z = message.q
-    numbers = within(_NORM_TOLERANCE, math.hypot(w, x, y, z) - 1.0)
-    frames = message.frame_id in _FRAMES and message.child_frame_id in _BODY_FRAMES
-    if not numbers or not frames or message.quality == _FAILED_QUALITY:
+    """Convert an ODOMETRY; None when a field cannot be true, for other frames, and for an estimator that has failed.
+
+    The velocity is in the body frame, or in the frame of the pose; the rates are those of the body in both cases.
+    """
+    size = math.hypot(*message.q)
+    frame, child = message.frame_id, message.child_frame_id
+    frames = frame in _FRAMES and child in (*_BODY_FRAMES, frame)
+    if not within(_NORM_TOLERANCE, size - 1.0) or not frames or message.quality == _FAILED_QUALITY:
         return None
+    w, x, y, z = (each / size for each in message.q)
+    velocity = (message.vx, message.vy, message.vz)
+    if child == frame:
+        velocity = _into_body((w, x, y, z), velocity)
     roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
     yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     motion = Motion(
         message.time_usec * 1000,
         (message.x, -message.y, -yaw),
-        message.vx,
-        -message.vy,
+        velocity[0],
+        -velocity[1],
         -message.yawspeed,
         -message.z,
         roll,
@@ -137,6 +144,19 @@ def _battery(received_ns: int, percent: int, voltage_v: float, centiamperes: int
     current_a = 0.0 if centiamperes == -1 else centiamperes / 100  # -1: the autopilot does not measure it
     possible = 0 <= percent <= 100 and within(MAX_VOLTAGE_V, voltage_v) and within(MAX_CURRENT_A, current_a)
     return BatteryState(received_ns, percent, voltage_v, current_a) if possible else None
+
+
+def _into_body(q: tuple[float, float, float, float], vector: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Rotate a vector of the local frame into the body frame by the unit quaternion of the rover's attitude."""
+    w, x, y, z = q
+    a, b, c = vector
+    # Twice the product of the inverse rotation's axis and the vector.
+    i, j, k = 2 * (z * b - y * c), 2 * (x * c - z * a), 2 * (y * a - x * b)
+    return (
+        a + w * i + z * j - y * k,
+        b + w * j + x * k - z * i,
+        c + w * k + y * i - x * j,
+    )
 
 
 def _is_possible(motion: Motion) -> bool:

@@ -31,7 +31,8 @@ class ModeWatch:
         self.armed = False
         self.yielded = False
         self.is_taken_over = False
-        """Whether, since the last `take_switched`, a person changed the mode of a rover that the bridge drove."""
+        """Whether, since the last `take_switched`, a person changed the mode of a rover that the bridge drove, or chose
+        an automatic mode, such as a mission, at any time."""
         self._autopilot = autopilot
         self._status = 0
         self._custom_mode = 0
@@ -74,7 +75,10 @@ class ModeWatch:
                 self.is_taken_over |= self.mode == modes.ARMED_DRIVE and status < _CRITICAL
         self.kind, self._custom_mode = kind, custom_mode
         self.armed = bool(base_mode & _ARMED_FLAG)
-        self.mode = mode_of(kind, self.armed)
+        before, self.mode = self.mode, mode_of(kind, self.armed)
+        # The bridge never requests this mode; without a latch the next arming would end the mission.
+        begins = self.mode == modes.ARMED_OTHER and before != modes.ARMED_OTHER
+        self.is_taken_over |= begins and status < _CRITICAL
 
     def take_switched(self) -> bool:
         """Return whether a mode change that the bridge did not request was seen since the last call."""

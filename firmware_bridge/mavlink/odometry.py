@@ -6,10 +6,10 @@ is not used: a rover's landed state says nothing about its motion.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Final
 
-from firmware_bridge.core.robot_state import BatteryState, RobotState, StampOrder
+from firmware_bridge.core.robot_state import BatteryState, RobotState, StampOrder, reported_code
 from firmware_bridge.mavlink.clock import VehicleClock
 from firmware_bridge.mavlink.inputs import (
     Attitude,
@@ -46,7 +46,9 @@ _NEVER_NS: Final = -(2**62)
 class OdometryInput:
     """Takes the autopilot's reports and gives at most one new state a step."""
 
-    def __init__(self) -> None:
+    def __init__(self, accepted: Collection[int] = (0,)) -> None:
+        """`accepted`: error codes of the robot file that hide no other one."""
+        self._accepted = accepted
         self._order = StampOrder()
         self._newest: tuple[int, Motion] | None = None
         self._attitude: tuple[int, Attitude] | None = None
@@ -122,15 +124,13 @@ class OdometryInput:
         if newest is None or watch.mode is None:
             return None
         received_ns, motion = newest
-        error = 0
-        if lost:
-            error = NO_HEARTBEAT
-        elif received_ns - self._jump_ns < _JUMP_NS:
-            error = JUMPED
-        elif received_ns - self._bad_ns < _ESTIMATE_NS:
-            error = BAD_ESTIMATE
-        elif watch.is_critical():
-            error = CRITICAL
+        found = {
+            NO_HEARTBEAT: lost,
+            JUMPED: received_ns - self._jump_ns < _JUMP_NS,
+            BAD_ESTIMATE: received_ns - self._bad_ns < _ESTIMATE_NS,
+            CRITICAL: watch.is_critical(),
+        }
+        error = reported_code([code for code, is_present in found.items() if is_present], self._accepted)
         self._last = self._state_of(motion, received_ns, watch.mode, error)
         return self._last
 

@@ -15,6 +15,10 @@ from firmware_bridge.mavlink.transport import open_transport
 
 _FAILING_WRITES: Final = 3  # in a row: 60 ms at 50 Hz, inside the 100 ms of fault matrix row 46
 _CLOCK_WARNING_NS: Final = 10_000_000_000
+_PX4_WARNING: Final = (
+    "autopilot px4: PX4's rover modules ignore the yaw rate of a setpoint, so a real PX4 rover does not turn as"
+    " commanded (read in PX4's source, not tried); the simulated one obeys it"
+)
 
 
 class RobotLink:
@@ -28,7 +32,10 @@ class RobotLink:
         if mavlink.signing_key is not None:
             self._signatures = Signatures(read_key(mavlink.signing_key), wall_ticks(), time.monotonic_ns())
         self._transport = open_transport(mavlink)
-        self._session = Session(mavlink, report, self._signatures, stream=self._transport.stream)
+        accepted = config.safety.accepted_error_codes
+        self._session = Session(mavlink, report, self._signatures, stream=self._transport.stream, accepted=accepted)
+        if mavlink.autopilot == "px4":
+            report(_PX4_WARNING)
         self._failing = self._failed = 0
         self._refused, self._warned_ns = 0, -_CLOCK_WARNING_NS
 

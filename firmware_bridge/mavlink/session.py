@@ -7,7 +7,7 @@ after somebody else has changed the mode (`mode_watch.py`).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -51,7 +51,6 @@ _REASON_WAIT_NS: Final = 200_000_000  # an autopilot's text may follow its ackno
 _OWN_NS: Final = 3_000_000_000
 _MAX_DENIALS: Final = 4
 _HELD: Final = "in control"
-_MAX_A_STEP: Final = 256  # messages; more in one step are left unread
 _VEHICLE: Final = (0, _SYS_STATUS, 22, _ATTITUDE, _POSITION, 77, 111, _BATTERY, _EKF, _ESTIMATOR, 253, _ODOMETRY)
 _OTHERS: Final = (*stations.MOTION_MESSAGES, stations.COMMAND_INT, stations.COMMAND_LONG)
 
@@ -66,10 +65,14 @@ class Session:
         signatures: Signatures | None = None,
         *,
         stream: bool = False,
+        accepted: Collection[int] = (0,),
     ) -> None:
-        """`tell` takes lines for the operator; `stream`: packets may be cut anywhere, as on a serial line."""
+        """`tell` takes lines for the operator; `stream`: packets may be cut anywhere, as on a serial line.
+
+        `accepted`: error codes of the robot file that hide no other one.
+        """
         self.watch = ModeWatch(modes.BY_NAME[config.autopilot])
-        self.odometry = OdometryInput()
+        self.odometry = OdometryInput(accepted)
         self.failsafes = FailsafeCheck(config)
         self.commands = CommandQueue()
         self.reader = Reader((*_VEHICLE, *_OTHERS), signatures, stream=stream)
@@ -89,7 +92,6 @@ class Session:
         }
         self._outbox: list[bytes] = []
         self._now_ns = 0
-        self._taken = 0
         self._foreign: str | None = None
         self._clash_ns = -_CLASH_NS
         self._identifying = False
@@ -106,10 +108,7 @@ class Session:
     def take(self, data: bytes, now_ns: int) -> None:
         """Read received bytes; what cannot be true is counted."""
         self._now_ns = now_ns
-        if self._taken >= _MAX_A_STEP:
-            return
         for message in self.reader.read(data, now_ns):
-            self._taken += 1
             self._handle(message, now_ns)
 
     def _handle(self, message: Message, now_ns: int) -> None:
@@ -189,7 +188,8 @@ class Session:
 
     def report(self, now_ns: int) -> Report:
         """Return the report of everything taken since the last call, and queue the packets that are due."""
-        self._now_ns, self._taken = now_ns, 0
+        self._now_ns = now_ns
+        self.reader.begin_step()
         self._periodic(now_ns)
         denied = self._explain(now_ns)
         foreign, self._foreign = self._foreign, None

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import socket
 from pathlib import Path
 from typing import Final
 
@@ -16,6 +19,7 @@ _NEXT_STEP: Final = {
     modes.ARMED_HOLD: modes.STEP_DRIVE,
 }
 _REPEAT_NS: Final = 2_000_000_000  # longer than all retries of one command
+_NO_ROUTE: Final = (errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN)
 
 
 def mavlink_of(config: RobotConfig) -> MavlinkConfig:
@@ -26,11 +30,14 @@ def mavlink_of(config: RobotConfig) -> MavlinkConfig:
 
 
 def missing_link(config: RobotConfig) -> str | None:
-    """Return in one line that the serial device is missing; None for UDP, whose socket opens without a robot."""
-    serial = mavlink_of(config).serial
-    if serial is None or Path(serial[0]).exists():
-        return None
-    return f"serial device {serial[0]} does not exist"
+    """Return in one line that the serial device or the route to a UDP address is missing; None once it is there."""
+    mavlink = mavlink_of(config)
+    if mavlink.serial is not None:
+        path = mavlink.serial[0]
+        return None if Path(path).exists() else f"serial device {path} does not exist"
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        error = probe.connect_ex(mavlink.address)  # sends nothing
+    return f"waiting for a route to {mavlink.address[0]}: {os.strerror(error)}" if error in _NO_ROUTE else None
 
 
 def robot_table(config: RobotConfig) -> RobotTable:

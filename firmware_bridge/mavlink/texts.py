@@ -34,7 +34,7 @@ class TextFilter:
             self.dropped += 1
             return None
         self._tokens -= 1.0
-        return f"the rover says: {line}"
+        return f"STATUSTEXT of the rover: {line}"
 
     def reason(self, since_ns: int) -> str | None:
         """Return the newest text, if it came at most one second before `since_ns`."""

@@ -24,7 +24,7 @@ _V1_HEADER: Final = 6
 _V2_HEADER: Final = 10
 _CRC: Final = 2
 _MAX_BUFFER_BYTES: Final = 8192  # of a serial line: four steps at 2 Mbaud
-_MAX_MESSAGES: Final = 128  # decoded per call, five times what the requested messages need
+_MAX_PACKETS: Final = 256  # examined per step, wanted or not: each costs a checksum, on a signed link a hash
 _MAX_FAILURES: Final = 32  # false packet starts per call: each costs a checksum
 _INCOMPLETE: Final = -1
 
@@ -53,17 +53,26 @@ class Reader:
         self._signatures = signatures
         self._stream = stream
         self._buffer = b""
+        self._left = _MAX_PACKETS
         self._parser = dialect.MAVLink(None)
 
+    def begin_step(self) -> None:
+        """Begin a step of the bridge, in which a bounded number of packets is examined."""
+        self._left = _MAX_PACKETS
+
     def read(self, data: bytes, now_ns: int) -> list[Message]:
-        """Return the wanted messages in `data`, a bounded number; after the first bad byte of a datagram, none."""
+        """Return the wanted messages in `data`; after the first bad byte of a datagram, none.
+
+        What one step's limit leaves over waits for the next step on a serial line, and is lost in a datagram.
+        """
         buffer = (self._buffer + data)[-_MAX_BUFFER_BYTES:]
         messages: list[Message] = []
         at = failures = 0
-        while at < len(buffer) and len(messages) < _MAX_MESSAGES and failures < _MAX_FAILURES:
+        while at < len(buffer) and self._left > 0 and failures < _MAX_FAILURES:
             length = _length(buffer, at)
             if length == _INCOMPLETE and self._stream:
                 break
+            self._left -= 1
             packet = buffer[at : at + length] if length > 0 else b""
             if not packet or not self._is_whole(packet, buffer[at + length : at + length + 1]):
                 self.counts.broken += 1

@@ -41,7 +41,7 @@ class Go2Reader:
         self.malformed = 0
         """States that were dropped because something in them cannot be."""
         self.malformed_battery = 0
-        """The same of battery reports, by which nobody drives."""
+        """Malformed battery reports; they do not affect driving."""
         self._on_death = on_death
         self._velocity_frame = config.odometry.velocity_frame
         self._state: RobotState | None = None

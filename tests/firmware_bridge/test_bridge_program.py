@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import ast
 import io
+import os
+import socket
 import subprocess
 import sys
+import time
 import tokenize
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from firmware_bridge.bridge import Bridge, is_pressed
+from firmware_bridge.bridge import Bridge, is_pressed, take_priority
 from firmware_bridge.bridge import main as bridge_main
 from firmware_bridge.client import BridgeClient, BridgeUnavailable
+from firmware_bridge.core.config import BRIDGE_PRIORITY
 from firmware_bridge.core.link import BridgeStatus
 from tests.support.processes import GO2_SIM, REPOSITORY
 
@@ -31,6 +35,82 @@ def test_a_frozen_bridge_does_not_feed_the_watchdog() -> None:
     shell._wake_ns = status.stamp_ns
     shell._report_progress(status)
     assert pings == [1]
+
+
+def waiting_shell(*files: socket.socket) -> Bridge:
+    """A bridge that polls these sockets of clients."""
+    shell = Bridge.__new__(Bridge)
+    shell._link = SimpleNamespace(files=lambda: files)  # type: ignore
+    shell._operators = shell._observers = SimpleNamespace(files=list)  # type: ignore
+    return shell
+
+
+def test_a_client_that_floods_the_bridge_does_not_keep_it_from_sleeping() -> None:
+    (bridge, client), (wakeup, signals) = socket.socketpair(), socket.socketpair()
+    with bridge, client, wakeup, signals:
+        client.send(b"x")  # never read here, as if a client had sent more than a step reads
+        shell, begin_ns = waiting_shell(bridge), time.monotonic_ns()
+        for _ in range(20):
+            assert not shell._wait(wakeup, time.monotonic_ns() + 10**9)
+        assert time.monotonic_ns() - begin_ns >= 20_000_000
+        signals.send(b"x")
+        assert shell._wait(wakeup, time.monotonic_ns() + 10**9)
+
+
+@pytest.mark.parametrize(("ahead_ns", "longest_s"), [(10**9, 1e-3), (200_000, 2e-4), (-(10**9), 0.0)])
+def test_the_pause_after_a_step_ends_before_the_next_step_is_due(
+    monkeypatch: pytest.MonkeyPatch, ahead_ns: int, longest_s: float
+) -> None:
+    slept: list[float] = []
+    wakeup, signals = socket.socketpair()
+    with wakeup, signals, monkeypatch.context() as patch:
+        signals.send(b"x")
+        patch.setattr(time, "sleep", slept.append)
+        assert waiting_shell()._wait(wakeup, time.monotonic_ns() + ahead_ns)
+    assert len(slept) == 1 and 0.0 <= slept[0] <= longest_s
+
+
+class FakeScheduling:
+    """The process's scheduling: policy and priority; `permitted`: whether the system grants real-time priorities."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, policy: int, priority: int, *, permitted: bool = True) -> None:
+        self.found, self._permitted = (policy, priority), permitted
+        monkeypatch.setattr(os, "sched_getscheduler", lambda _: self.found[0])
+        monkeypatch.setattr(os, "sched_getparam", lambda _: os.sched_param(self.found[1]))
+        monkeypatch.setattr(os, "sched_setscheduler", self._set)
+
+    def _set(self, _: int, policy: int, param: os.sched_param) -> None:
+        if not self._permitted:
+            raise PermissionError(1, "Operation not permitted")
+        self.found = policy, param.sched_priority
+
+
+OURS = (os.SCHED_FIFO, BRIDGE_PRIORITY)
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ((os.SCHED_OTHER, 0), OURS),
+        ((os.SCHED_FIFO, BRIDGE_PRIORITY - 1), OURS),
+        ((os.SCHED_RR, BRIDGE_PRIORITY + 1), (os.SCHED_RR, BRIDGE_PRIORITY + 1)),
+        ((os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, 99), (os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, 99)),
+    ],
+)
+def test_the_bridge_takes_its_real_time_priority_and_keeps_a_higher_one(
+    monkeypatch: pytest.MonkeyPatch, before: tuple[int, int], after: tuple[int, int]
+) -> None:
+    with monkeypatch.context() as patch:
+        scheduling = FakeScheduling(patch, *before)
+        take_priority()
+    assert scheduling.found == after
+
+
+def test_a_bridge_without_the_right_to_a_priority_runs_without_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        scheduling = FakeScheduling(patch, os.SCHED_OTHER, 0, permitted=False)
+        take_priority()
+    assert scheduling.found == (os.SCHED_OTHER, 0)
 
 
 @pytest.mark.parametrize(("content", "pressed"), [(b"0\n", False), (b"1\n", True), (b"", True), (b"junk", True)])

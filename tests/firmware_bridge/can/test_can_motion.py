@@ -47,8 +47,8 @@ def first_error(
     check = AgreementCheck(limits)
     check.check(0, (0.0, 0.0), (0.0, 0.0), 0.0)
     for step in range(1, 251):
-        if code := check.check(step * 20 * MS, moved, commanded, gyro):
-            return code, step * 0.02
+        if codes := check.check(step * 20 * MS, moved, commanded, gyro):
+            return codes[0], step * 0.02
     return None
 
 
@@ -89,4 +89,11 @@ def test_a_disagreement_with_a_break_is_not_an_error() -> None:
     check = AgreementCheck(LIMITS)
     for step in range(500):
         moved = (0.0, 0.0) if step % 90 else (0.5, 0.0)
-        assert check.check(step * 20 * MS, moved, (0.5, 0.0), 0.0) == 0
+        assert check.check(step * 20 * MS, moved, (0.5, 0.0), 0.0) == ()
+
+
+def test_both_errors_are_reported_at_once() -> None:
+    check = AgreementCheck(LIMITS)
+    for step in range(151):
+        codes = check.check(step * 20 * MS, (0.0, 1.0), (0.5, 0.0), 0.0)
+    assert codes == (ERROR_COMMAND, ERROR_GYRO)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import can
@@ -22,8 +23,12 @@ Opener = Callable[..., tuple[CanRig, BridgeBench]]
 def opened() -> Iterator[Opener]:
     rigs: list[CanRig] = []
 
-    def open_rig(path: Path = CARTER, **changes: object) -> tuple[CanRig, BridgeBench]:
-        rigs.append(CanRig(config=virtual(path, **changes)))
+    def open_rig(
+        path: Path = CARTER, accepted: tuple[int, ...] = (0,), **changes: object
+    ) -> tuple[CanRig, BridgeBench]:
+        config = virtual(path, **changes)
+        safety = replace(config.safety, accepted_error_codes=accepted)
+        rigs.append(CanRig(config=replace(config, safety=safety)))
         return rigs[-1], BridgeBench(rigs[-1])
 
     yield open_rig
@@ -233,6 +238,24 @@ def test_a_fault_bit_of_the_base_stops_it_with_its_number(opened: Opener, index:
     assert bench.core.status(rig.now_ns()).reason == f"the robot reports error {code}"
 
 
+@pytest.mark.parametrize(("index", "code"), [(1, 102), (3, 104)])
+def test_an_accepted_fault_hides_no_other_one(opened: Opener, index: int, code: int) -> None:
+    rig, bench = opened(accepted=(0, 101))
+    rig.base.places = {"can.faults[0]": 1}
+    bench.drive()
+    rig.base.places = {"can.faults[0]": 1, f"can.faults[{index}]": 1}
+    assert stopped_by(bench, "robot_error", 1.0) <= 0.16
+    assert bench.core.status(rig.now_ns()).reason == f"the robot reports error {code}"
+
+
+def test_an_accepted_fault_does_not_hide_wheels_that_slip(opened: Opener) -> None:
+    rig, bench = opened(accepted=(0, 101))
+    rig.base.places = {"can.faults[0]": 1}
+    bench.drive(0.2, 0.8)
+    rig.base.turns = 0.1
+    assert stopped_by(bench, "robot_error", 3.0) <= 1.1
+
+
 def test_an_encoder_that_reports_nothing_is_an_error_of_the_gyroscope_check(opened: Opener) -> None:
     rig, bench = opened(EXAMPLE)
     bench.drive(0.5)
@@ -273,7 +296,7 @@ def test_wheel_speeds_become_the_pose_of_the_base(opened: Opener) -> None:
 
 
 def test_no_report_is_dropped_when_the_bridge_joins_a_base_that_runs_for_long(opened: Opener) -> None:
-    rig, bench = opened(state=None, mode=None)  # its clock comes later than its first odometry
+    rig, bench = opened(state=None, mode=None, estop=None)  # its clock comes later than its first odometry
     bench.run(1.5)
     assert rig.link.dropped()[1] == 0
     first = next(report.state for report in bench.reports if report.state)

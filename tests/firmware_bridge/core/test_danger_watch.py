@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from firmware_bridge.core.dangers import NO_BATTERY, NO_STATE, DangerWatch, is_driven, is_moving
-from firmware_bridge.core.robot_state import BatteryState, RobotState
+from firmware_bridge.core.robot_state import BatteryState, RobotState, reported_code
 from firmware_bridge.core.step_types import Inputs, Report
 from tests.support.robot.bridge_bench import MS, SAFETY, STILL, TABLE
 
@@ -31,6 +31,23 @@ def watch(report: Report | None = None, *, estop: bool = False, **safety: object
 def cause(made: DangerWatch, after_ns: int = 0) -> str:
     danger = made.danger(T0 + after_ns)
     return "none" if danger is None else danger[0]
+
+
+@pytest.mark.parametrize(
+    ("codes", "accepted", "reported"),
+    [
+        ((), (0,), 0),
+        ((), (), 0),
+        ((3, 4), (0,), 3),
+        ((3, 4), (0, 3), 4),
+        ((3, 4, 5), (3, 5), 4),
+        ((3, 4), (3, 4), 3),
+    ],
+)
+def test_an_accepted_error_code_hides_no_other_one(
+    codes: tuple[int, ...], accepted: tuple[int, ...], reported: int
+) -> None:
+    assert reported_code(codes, accepted) == reported
 
 
 def test_a_standing_robot_is_no_danger_and_neither_is_none() -> None:

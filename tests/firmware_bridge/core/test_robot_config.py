@@ -78,6 +78,58 @@ def test_a_mavlink_link_is_an_address_of_the_network_or_a_serial_device_with_its
     assert line.serial == line.address == ("/dev/ttyACM0", 57600)
 
 
+@pytest.mark.parametrize(
+    ("link", "complaint"),
+    [
+        ("udp:10.0.0.7:" + "1" * 5000, "mavlink.link: expected udp:HOST:PORT or serial:PATH:BAUD"),
+        ("serial:/dev/ttyACM0:" + "9" * 5000, "mavlink.link: expected udp:HOST:PORT or serial:PATH:BAUD"),
+        ("serial:/dev/ttyACM0:20000000", "mavlink.link: expected udp:HOST:PORT or serial:PATH:BAUD"),
+        ("serial:/dev/ttyACM0:1000001", "mavlink.link: expected a speed of 57600"),
+        ("udp:10.0.0.7:0", "mavlink.link: expected an IPv4 address and a port"),
+        ("udp:10.0.0.7:65536", "mavlink.link: expected an IPv4 address and a port"),
+        ("udp:10.0.0." + "1" * 5000 + ":14540", "mavlink.link: expected an IPv4 address and a port"),
+        ("udp:10.0.0.256:14540", "mavlink.link: expected an IPv4 address and a port"),
+        ("udp:010.0.0.7:14540", "mavlink.link: expected an IPv4 address and a port"),
+        ("udp:rover:14540", "mavlink.link: expected an IPv4 address and a port"),
+    ],
+)
+def test_a_mavlink_link_of_another_form_is_refused_in_one_line(link: str, complaint: str) -> None:
+    rover = load_robot_config(GO2_SIM.with_name("rover_px4.toml")).mavlink
+    assert rover is not None
+    with pytest.raises(ConfigError, match=re.escape(complaint)):
+        replace(rover, link=link)
+
+
+@pytest.mark.parametrize("number", ["2", "-2", "2.5", "2.", ".5", "-.5", "9" * 20, "0." + "9" * 20])
+def test_a_constant_of_a_can_message_is_a_decimal_number(number: str) -> None:
+    base = load_robot_config(GO2_SIM.with_name("example_can.toml")).can
+    assert base is not None
+    replace(base, constants=(f"DriveCommand.Gear={number}",))
+
+
+@pytest.mark.parametrize(
+    "number", ["", "-", ".", "--2", "+2", "2-", "1e3", "0x2", "2.5.1", "٣", "9" * 21, "0." + "9" * 21]
+)
+def test_another_constant_of_a_can_message_is_refused(number: str) -> None:
+    base = load_robot_config(GO2_SIM.with_name("example_can.toml")).can
+    assert base is not None
+    with pytest.raises(ConfigError, match=r'can.constants: expected "MESSAGE.SIGNAL=NUMBER", found'):
+        replace(base, constants=(f"DriveCommand.Gear={number}",))
+
+
+def test_a_base_whose_latched_stop_the_bridge_resets_must_name_its_state_after_a_stop() -> None:
+    base = load_robot_config(GO2_SIM.with_name("carter_can_sim.toml")).can
+    assert base is not None and base.state is not None and base.estop is not None
+    unnamed = replace(base.state, estop=-1)
+    for changes in ({"state": unnamed}, {"state": None, "mode": None}):
+        with pytest.raises(ConfigError, match=r"missing key can.state.estop"):
+            replace(base, **changes)
+        for part in ("latched", "request"):
+            replace(base, **changes, estop=replace(base.estop, **{part: ""}))
+        replace(base, **changes, estop=None)
+    replace(base, state=replace(base.state, estop=0))
+
+
 def test_the_bridge_has_the_rovers_mavlink_system_number_unless_it_has_one_of_its_own() -> None:
     rover = load_robot_config(GO2_SIM.with_name("rover_px4.toml")).mavlink
     assert rover is not None
@@ -111,7 +163,15 @@ def test_a_domain_for_a_robot_without_dds_is_refused() -> None:
         ('velocity_frame = "odom"', 'velocity_frame = "map"', "odometry.velocity_frame"),
         ("[limits]", "[limits", "cannot be read"),
         ("[camera]", "[[camera]]", "[camera]: expected a table, found ["),
-        ("accel_mps2 = 2.0", f"accel_mps2 = {10**400}", "limits.accel_mps2: expected float"),
+        ("accel_mps2 = 2.0", f"accel_mps2 = {10**400}", "limits.accel_mps2: expected float, found 1"),
+        ("accel_mps2 = 2.0", "accel_mps2 = 1e301", "limits.accel_mps2: expected float, found 1e+301"),
+        ('protocol = "unitree"', 'protocol = ["can"]', "protocol: expected str, found ['can']"),
+        ('protocol = "unitree"', "protocol = {can = 1}", "protocol: expected str, found {'can': 1}"),
+        (
+            'protocol = "unitree"',
+            'protocol = ["ros2"]\n[ros2]\npublish = true',
+            "protocol: expected str, found ['ros2']",
+        ),
         (
             "battery_min_percent = 10",
             "battery_min_percent = 91",

@@ -49,18 +49,47 @@ def odometry(**changes: object) -> object:
 def test_odometry_and_position_report_the_same_motion(
     x: float, y: float, theta: float, v: float, side: float, w: float
 ) -> None:
-    """A rover at (x, y, theta) of the bridge's axes, seen through both messages of MAVLink."""
+    """A rover at (x, y, theta) of the bridge's axes, seen through both messages of MAVLink, one with two frames."""
     yaw = -theta
     both = odometry(x=x, y=-y, q=quaternion(0.0, 0.0, yaw), vx=v, vy=-side, yawspeed=-w)
     north, east = v * math.cos(yaw) + side * math.sin(yaw), v * math.sin(yaw) - side * math.cos(yaw)
     position = dialect.MAVLink_local_position_ned_message(5000, x, -y, 0.0, north, east, 0.0)
+    local = odometry(
+        x=x, y=-y, q=quaternion(0.0, 0.0, yaw), frame_id=1, child_frame_id=1, vx=north, vy=east, yawspeed=-w
+    )
     found = motion_of_odometry(both)
     split = motion_of_position(position, Attitude(0, 0.0, 0.0, theta, w))
-    for motion in (found, split):
+    for motion in (found, split, motion_of_odometry(local)):
         assert motion is not None and motion.stamp_ns == 5_000_000_000
         assert motion.T_odom_base[:2] == pytest.approx((x, y))
         assert abs(wrap_angle(motion.T_odom_base[2] - theta)) < 1e-6
         assert (motion.vx_mps, motion.vy_mps, motion.wz_radps) == pytest.approx((v, side, w), abs=1e-6)
+
+
+@given(
+    roll=ANGLE, pitch=st.floats(-1.5, 1.5), yaw=ANGLE, v=SPEED, side=SPEED, down=SPEED, frame=st.sampled_from((1, 20))
+)
+@settings(max_examples=60, deadline=None)
+def test_a_velocity_of_the_poses_frame_becomes_that_of_the_body_at_any_tilt(
+    roll: float, pitch: float, yaw: float, v: float, side: float, down: float, frame: int
+) -> None:
+    """The velocity is turned by the three matrices of roll, pitch and yaw, which share nothing with a quaternion."""
+    x, y, z = v, math.cos(roll) * side - math.sin(roll) * down, math.sin(roll) * side + math.cos(roll) * down
+    x, z = math.cos(pitch) * x + math.sin(pitch) * z, math.cos(pitch) * z - math.sin(pitch) * x
+    x, y = math.cos(yaw) * x - math.sin(yaw) * y, math.sin(yaw) * x + math.cos(yaw) * y
+    q = quaternion(roll, pitch, yaw)
+    motion = motion_of_odometry(odometry(q=q, frame_id=frame, child_frame_id=frame, vx=x, vy=y, vz=z))
+    assert motion is not None
+    assert (motion.vx_mps, motion.vy_mps) == pytest.approx((v, -side), abs=1e-6)
+
+
+@given(yaw=ANGLE, north=SPEED, east=SPEED, size=st.floats(0.96, 1.04))
+@settings(max_examples=60, deadline=None)
+def test_the_turn_into_the_body_frame_keeps_the_speed(yaw: float, north: float, east: float, size: float) -> None:
+    q = tuple(each * size for each in quaternion(0.0, 0.0, yaw))
+    motion = motion_of_odometry(odometry(q=q, frame_id=1, child_frame_id=1, vx=north, vy=east))
+    assert motion is not None
+    assert math.hypot(motion.vx_mps, motion.vy_mps) == pytest.approx(math.hypot(north, east), abs=1e-9)
 
 
 @given(theta=st.floats(-3.0, 3.0), v=st.floats(0.2, 1.0), w=st.floats(-1.0, 1.0))
@@ -97,6 +126,7 @@ def test_both_attitudes_agree(roll: float, pitch: float, yaw: float) -> None:
     [
         {"x": NAN}, {"vy": math.inf}, {"yawspeed": 1e9}, {"q": (0.0, 0.0, 0.0, 0.0)}, {"q": (NAN,) * 4},
         {"frame_id": 0}, {"child_frame_id": 1}, {"quality": -1}, {"z": -1e9}, {"time_usec": 2**63},
+        {"frame_id": 1, "child_frame_id": 20}, {"frame_id": 1, "child_frame_id": 1, "vz": NAN}, {"child_frame_id": 0},
     ],
 )  # fmt: skip
 def test_an_impossible_report_is_dropped_whole(changes: dict[str, object]) -> None:

@@ -53,12 +53,44 @@ def test_a_failsafe_of_the_autopilot_is_no_takeover(status: int) -> None:
     assert watch.take_switched() and not watch.is_taken_over
 
 
-def test_a_mode_change_of_a_rover_that_the_bridge_does_not_drive_is_no_takeover() -> None:
+def test_a_pilots_mode_of_a_rover_that_the_bridge_does_not_drive_is_no_takeover() -> None:
     watch = driven()
     watch.ask(modes.HOLD, 2 * S)
     beat(watch, HOLD, 2 * S)
     beat(watch, MANUAL, 3 * S)
     assert watch.take_switched() and not watch.is_taken_over
+
+
+def test_a_mission_that_a_person_begins_is_a_takeover_also_of_a_rover_that_the_bridge_does_not_drive() -> None:
+    watch = ModeWatch(modes.PX4)
+    beat(watch, HOLD, 0)
+    beat(watch, MISSION, S)
+    assert watch.is_taken_over
+    watch.take_switched()
+    beat(watch, MISSION, 2 * S)
+    assert not watch.is_taken_over
+
+
+def test_a_mission_that_was_begun_before_the_bridge_is_a_takeover() -> None:
+    watch = ModeWatch(modes.PX4)
+    beat(watch, MISSION, 0)
+    assert watch.is_taken_over
+
+
+def test_a_mission_counts_from_the_arming_of_the_rover_on() -> None:
+    watch = ModeWatch(modes.PX4)
+    beat(watch, MISSION, 0, DISARMED)
+    assert not watch.is_taken_over
+    beat(watch, MISSION, S)
+    assert watch.is_taken_over
+
+
+def test_an_automatic_mode_of_a_failsafe_is_no_takeover() -> None:
+    watch = ModeWatch(modes.PX4)
+    beat(watch, HOLD, 0)
+    beat(watch, MISSION, S, status=CRITICAL)
+    beat(watch, MISSION, 2 * S)
+    assert not watch.is_taken_over
 
 
 def test_a_change_is_reported_once() -> None:

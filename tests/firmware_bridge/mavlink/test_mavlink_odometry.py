@@ -23,8 +23,8 @@ OFFBOARD = 6 << 16
 class Rover:
     """Reports into one OdometryInput, of a rover whose clock is that of the test."""
 
-    def __init__(self) -> None:
-        self.input, self.clock, self.watch = OdometryInput(), VehicleClock(), ModeWatch(modes.PX4)
+    def __init__(self, accepted: tuple[int, ...] = (0,)) -> None:
+        self.input, self.clock, self.watch = OdometryInput(accepted), VehicleClock(), ModeWatch(modes.PX4)
         self.watch.heartbeat(12, OFFBOARD, 128, 4, 0)
 
     def synchronise(self, now_ns: int) -> None:
@@ -154,6 +154,18 @@ def test_a_failsafe_in_the_setpoint_mode_is_an_error() -> None:
     rover.watch.heartbeat(12, OFFBOARD, 128, 5, S)
     rover.odometry(10 * S)
     assert rover.error() == CRITICAL
+
+
+@pytest.mark.parametrize(
+    ("accepted", "lost", "error"),
+    [((0,), False, BAD_ESTIMATE), ((0, BAD_ESTIMATE), False, CRITICAL), ((0, BAD_ESTIMATE), True, NO_HEARTBEAT)],
+)
+def test_an_accepted_error_hides_no_other_one(accepted: tuple[int, ...], lost: bool, error: int) -> None:
+    rover = Rover(accepted)
+    rover.watch.heartbeat(12, OFFBOARD, 128, 5, S)
+    rover.estimator(1, 10 * S)
+    rover.odometry(10 * S)
+    assert rover.error(lost=lost) == error
 
 
 def test_missing_heartbeats_are_an_error() -> None:

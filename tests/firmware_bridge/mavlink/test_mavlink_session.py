@@ -162,6 +162,26 @@ class TestTakeover:
         bench.until(lambda: bench.mode is Mode.OFFBOARD, 10.0, "an arming")
         bench.drive()
 
+    def test_a_new_run_ends_no_mission_without_an_operators_arm(self) -> None:
+        bench = RoverBench()
+        bench.asking = False
+        bench.run(2.0)
+        bench.to_bridge = lambda packet: () if packet[7:10] == b"\0\0\0" else (packet,)  # no heartbeat of its own
+
+        def drive_the_mission(seconds: int) -> None:
+            for _ in range(seconds):
+                bench.arrive(bench.pack(common.MAVLink_heartbeat_message(10, 12, 128, 4 << 16 | 4 << 24, 4, 3)))
+                bench.run(1.0)
+
+        drive_the_mission(2)
+        bench.asking = True
+        drive_the_mission(5)
+        assert bench.status is not None and bench.status.permit == "needed"
+        assert not bench.commands(SET_MODE) and not bench.commands(ARM_DISARM)
+        bench.operator = [Arm()]
+        drive_the_mission(10)
+        assert bench.commands(SET_MODE)
+
     @pytest.mark.parametrize("mode", [Mode.MANUAL, Mode.HOLD])
     def test_a_mode_of_a_ground_station_ends_the_drive_and_stays(self, mode: Mode) -> None:
         bench = driving()
@@ -352,7 +372,7 @@ class TestSigning:
 def test_the_operator_gets_the_autopilots_texts() -> None:
     bench = RoverBench()
     bench.arrive(bench.pack(common.MAVLink_statustext_message(4, b"wheel speed high")))
-    assert bench.lines == ["the rover says: wheel speed high"]
+    assert bench.lines == ["STATUSTEXT of the rover: wheel speed high"]
 
 
 def test_a_flood_of_texts_is_thinned_for_the_operator() -> None:

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 import tty
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from firmware_bridge.core.config import RobotConfig
 from firmware_bridge.core.robot_state import LinkOpenError
+from firmware_bridge.mavlink.robot_link import RobotLink
+from firmware_bridge.mavlink.table import missing_link
 from firmware_bridge.mavlink.transport import SerialTransport, UdpTransport
+from tests.support.robot.rover_bench import ROBOTS, robot_file
 
 S = 1_000_000_000
 BAUD = 921600
@@ -117,3 +123,46 @@ class TestUdp:
             taken.bind(("", 0))
             with pytest.raises(LinkOpenError, match="expected a free port"):
                 UdpTransport("127.0.0.1", 1, taken.getsockname()[1])
+
+
+class TestMissingLink:
+    @pytest.mark.parametrize("error", [errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN])
+    def test_an_address_without_a_route_is_waited_for(self, monkeypatch: pytest.MonkeyPatch, error: int) -> None:
+        with monkeypatch.context() as patch:
+            patch.setattr(socket.socket, "connect_ex", lambda *_: error)
+            missing = missing_link(robot_file(link="udp:10.0.0.7:14580"))
+        assert missing == f"waiting for a route to 10.0.0.7: {os.strerror(error)}"
+
+    def test_an_address_with_a_route_is_there_although_nothing_listens(self) -> None:
+        assert missing_link(robot_file(link="udp:127.0.0.1:1")) is None
+
+    def test_another_error_is_left_to_the_opening_which_reports_it(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        with monkeypatch.context() as patch:
+            patch.setattr(socket.socket, "connect_ex", lambda *_: errno.EACCES)
+            assert missing_link(robot_file(link="udp:10.0.0.7:14580")) is None
+
+    def test_a_serial_device_is_waited_for(self, pty_pair: tuple[int, Path], tmp_path: Path) -> None:
+        path = tmp_path / "none"
+        assert missing_link(robot_file(link=f"serial:{path}:{BAUD}")) == f"serial device {path} does not exist"
+        assert missing_link(robot_file(link=f"serial:{pty_pair[1]}:{BAUD}")) is None
+
+
+def lines_at_start(config: RobotConfig) -> list[str]:
+    lines: list[str] = []
+    RobotLink(config, lines.append).close()
+    return lines
+
+
+class TestRobotLink:
+    def test_a_px4_rover_gets_one_line_about_its_yaw_rate_and_another_none(self) -> None:
+        link = "udp:127.0.0.1:9"
+        (line,) = lines_at_start(robot_file(link=link))
+        assert "PX4's rover modules ignore the yaw rate" in line and "\n" not in line
+        assert lines_at_start(robot_file(ROBOTS / "rover_ardupilot.toml", link=link)) == []
+
+    def test_the_robot_files_accepted_errors_reach_the_odometry(self) -> None:
+        config = robot_file(link="udp:127.0.0.1:9")
+        safety = replace(config.safety, accepted_error_codes=(0, 2))
+        link = RobotLink(replace(config, safety=safety), lambda _: None)
+        link.close()
+        assert link._session.odometry._accepted == (0, 2)

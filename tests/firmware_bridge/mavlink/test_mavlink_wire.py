@@ -75,6 +75,34 @@ class TestStream:
         assert len(reader._buffer) <= 8192
 
 
+@pytest.mark.parametrize("is_signed", [False, True])
+@pytest.mark.parametrize("stream", [False, True])
+def test_a_step_examines_a_bounded_number_of_unwanted_or_unsigned_packets(
+    monkeypatch: pytest.MonkeyPatch, is_signed: bool, stream: bool
+) -> None:
+    examined: list[bytes] = []
+    check = Reader._is_whole
+    monkeypatch.setattr(Reader, "_is_whole", lambda *given: examined.append(given[1]) or check(*given))
+    reader, writer = Reader((ATTITUDE,), signatures() if is_signed else None, stream=stream), Writer(1, 1)
+    unwanted = writer.pack(dialect.MAVLink_heartbeat_message(10, 12, 0, 0, 4, 3), 0)
+    for _ in range(64):
+        assert reader.read(unwanted * 10, 0) == []
+    assert len(examined) == 256
+    reader.begin_step()
+    for _ in range(64):
+        reader.read(unwanted * 10, 0)
+    assert 500 <= len(examined) <= 512  # a serial line's buffer may begin within a packet now
+
+
+def test_after_a_flood_the_next_step_reads_again() -> None:
+    reader, writer = Reader((ATTITUDE,)), Writer(1, 1)
+    for _ in range(300):
+        reader.read(writer.pack(dialect.MAVLink_heartbeat_message(10, 12, 0, 0, 4, 3), 0), 0)
+    assert reader.read(writer.pack(attitude(1), 0), 0) == []
+    reader.begin_step()
+    assert len(reader.read(writer.pack(attitude(2), 0), 0)) == 1
+
+
 def test_a_datagram_is_ignored_from_its_first_bad_byte() -> None:
     reader, writer = Reader((ATTITUDE,)), Writer(1, 1)
     good = writer.pack(attitude(1), 0)
