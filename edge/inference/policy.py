@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from typing import cast
+from collections.abc import Callable, Sequence
+from typing import TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,7 @@ from edge.inference.scheduling import Schedule, TickActivity, run_as
 from edge.state.semantic import Context, SemanticState, waypoints_now
 
 FloatArray = npt.NDArray[np.float32]
+Result = TypeVar("Result")
 
 
 class Policy:
@@ -79,7 +80,7 @@ class Policy:
         # Neither call copies data: both set where the graph reads and writes.
         self._encoding.bind_ortvalue_input("frame", ort.OrtValue.ortvalue_from_numpy(frame))
         self._encoding.bind_ortvalue_output("visual_tokens", ort.OrtValue.ortvalue_from_numpy(tokens))
-        self._run(self._vision, self._encoding)
+        self._in_tick(lambda: self._vision.run_bound(self._encoding))
         return tokens
 
     def semantic_context(self, last_layer_kv: FloatArray, interrupt: Interrupt | None = None) -> Context:
@@ -112,7 +113,8 @@ class Policy:
         if self.guided_by_waypoints:
             if semantic.waypoints is None:
                 raise GraphError("the semantic state has no waypoints to be guided by")
-            context = self.make_context({"waypoints": waypoints_now(semantic.waypoints, offset)})
+            feeds: Context = {"waypoints": waypoints_now(semantic.waypoints, offset)}
+            context = self._in_tick(lambda: self.make_context(feeds))
         if context is not self._bound:
             for name, tensor in context.items():
                 self._acting.bind_ortvalue_input(name, ort.OrtValue.ortvalue_from_numpy(tensor))
@@ -123,12 +125,13 @@ class Policy:
         self._acting.bind_ortvalue_input("visual_tokens", ort.OrtValue.ortvalue_from_numpy(visual_tokens))
         for name, value in self._small.items():
             self._acting.bind_ortvalue_input(name, value)
-        self._run(self._action, self._acting)
+        self._in_tick(lambda: self._action.run_bound(self._acting))
         return cast(FloatArray, self._trajectory[0].copy())
 
-    def _run(self, graph: Graph, binding: ort.IOBinding) -> None:
+    def _in_tick(self, call: Callable[[], Result]) -> Result:
+        """Run one call of a tick, to which reasoning gives way, and return its result."""
         self._activity.begin(time.monotonic_ns())
         try:
-            graph.run_bound(binding)
+            return call()
         finally:
             self._activity.end(time.monotonic_ns())

@@ -28,7 +28,7 @@ SPARE_CORES = 1
 """Cores left to camera, odometry and recorder before reasoning's threads are pinned; with fewer, the operating system
 distributes the cores better."""
 PRIORITY_STEPS = 10
-"""Distance in real-time priority from the control thread to the inputs' threads, and from them to reasoning."""
+"""Distance in real-time priority from the late-command thread to the inputs' threads, and from them to reasoning."""
 ROUND_NS = 1_000_000
 """Period at which a waiting reasoning thread checks again, ns."""
 GAP_NS = 2_000_000
@@ -67,6 +67,8 @@ class Schedule:
     """
 
     control: Role
+    late_command: Role
+    """Thread that sends zero in place of a late command: above control and on any core, so that no tick delays it."""
     inputs: Role
     """Threads that read the robot, record or print."""
     reasoning: Role
@@ -81,7 +83,7 @@ class Schedule:
 def schedule_for(artifacts: Artifacts, allowed: Collection[int] | None = None) -> Schedule:
     """Return the schedule of a target's artifacts on this process's cores.
 
-    Without permission for control's real-time priority no thread gets one: the order of the others would be wrong.
+    Without permission for the target's real-time priority no thread gets one: the order of the others would be wrong.
     """
     runtime = artifacts.runtime
     reasoning_graphs = (*artifacts.language_graphs, "semantic_context")
@@ -115,7 +117,8 @@ def make_schedule(
     """Return the roles from the target's settings and the available cores; pure.
 
     Without cores in the target, reasoning avoids the control thread's cores if enough others are available. A thread
-    for whose real-time priority there is no number above 0 has an ordinary one.
+    for whose real-time priority there is no number above 0 has an ordinary one. `control_priority` is the highest
+    number that the runner's service permits (LimitRTPRIO): the late-command thread has it, control one less.
     """
     available = set(allowed)
     notes = [
@@ -135,7 +138,8 @@ def make_schedule(
     inputs_priority = fifo - PRIORITY_STEPS if fifo > PRIORITY_STEPS else None
     lowest = fifo - 2 * PRIORITY_STEPS if fifo > 2 * PRIORITY_STEPS else None
     return Schedule(
-        control=Role("control", tuple(sorted(control)), control_priority, CONTROL_NICENESS),
+        control=Role("control", tuple(sorted(control)), fifo - 1 if fifo > 1 else control_priority, CONTROL_NICENESS),
+        late_command=Role("late-command", (), control_priority, CONTROL_NICENESS),
         inputs=Role("inputs", priority=inputs_priority),
         reasoning=Role("reasoning", cores, lowest, REASONING_NICENESS),
         # Without cores of their own they stay ordinary: an operator's stop must not wait for a core.

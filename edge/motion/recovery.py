@@ -28,7 +28,7 @@ from firmware_bridge.core.config import LimitsConfig
 
 OK: Final = "ok"
 BACKING_OFF: Final = "backing-off"
-TURNING: Final = "turning-to-words"
+TURNING: Final = "turning-to-waypoints"
 ARRIVED: Final = "arrived"
 """Reason of a command: the plan's own, or a recovery's."""
 MOVING: Final = frozenset((BACKING_OFF, TURNING))
@@ -54,7 +54,7 @@ ASIDE_M: Final = 1.5
 
 @dataclass(frozen=True)
 class BackOffConfig:
-    """When and how far the robot backs off. With the robot file's `vx_min_mps` of 0 it never reverses."""
+    """Thresholds and speeds of the back-off; with the robot file's `vx_min_mps` of 0 the robot never reverses."""
 
     vx_min_mps: float
     wz_max_radps: float
@@ -93,7 +93,7 @@ class _Commanded:
 
 @dataclass
 class _Retreat:
-    """A drive back under way, `times` as far as the first one at the same place."""
+    """Drive back in progress, `times` as far as the first one at the same place."""
 
     start: SE2
     since_ns: int
@@ -103,7 +103,7 @@ class _Retreat:
 
 
 class BackOff:
-    """Detects that the robot is stuck, and drives it back."""
+    """Back-off recovery: detects a stuck robot and drives it back."""
 
     def __init__(self, config: BackOffConfig) -> None:
         self._config = config
@@ -187,7 +187,7 @@ class BackOff:
 
 @dataclass(frozen=True)
 class StandstillConfig:
-    """When the robot turns at a standstill, and how fast."""
+    """Thresholds and speed of the turn at a standstill."""
 
     wz_max_radps: float
     """The robot file's limit."""
@@ -223,7 +223,7 @@ class StandstillConfig:
 
 @dataclass
 class _Turn:
-    """A turn under way."""
+    """Turn in progress."""
 
     heading_rad: float
     last_rad: float
@@ -231,7 +231,7 @@ class _Turn:
 
 
 class StandstillTurn:
-    """Detects that the plan has stood still for long, and turns the robot towards the waypoints."""
+    """Turn at a standstill: detects a plan that stands for long and turns the robot towards the waypoints."""
 
     def __init__(self, config: StandstillConfig) -> None:
         self._config = config

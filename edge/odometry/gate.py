@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from edge.core.geometry import wrap_angle
 from edge.safety.faults.findings import Finding
@@ -34,7 +34,8 @@ CLOCK_DRIFT = 100e-6
 """Largest rate difference between the robot's clock and ours; more counts as a delay."""
 CLOCK_BACK_NS = 100_000_000
 CLOCK_STEP_NS = 5_000_000_000
-"""The robot's clock was set when its stamps go back by more than the first, or deviate from ours by the second."""
+"""The robot's clock was set when its stamps go back by more than the first, or the offset between its clock and ours
+grows by more than the second from one report to the next. An offset that grows more slowly is a delay."""
 
 # The robot stands when all reported signals stay below these for STILL_NS.
 STILL_NS = 300_000_000
@@ -90,6 +91,20 @@ class Verdict:
     findings: tuple[Finding, ...]
 
 
+@dataclass(frozen=True)
+class _RobotClock:
+    """Difference between the robot's clock and ours, by the reports so far, ns."""
+
+    at_ns: int
+    """Arrival of the quickest report."""
+    least_ns: int
+    """Its offset: arrival minus stamp."""
+    stamp_ns: int
+    """Newest stamp."""
+    offset_ns: int
+    """Offset of the last report."""
+
+
 def age_findings(age_ns: int) -> tuple[Finding, ...]:
     """Return row 11's finding for a pose of this age."""
     if age_ns > MAX_AGE_ZERO_NS:
@@ -109,7 +124,7 @@ class OdometryGate:
         self._apart_sums = [0.0, 0.0, 0.0, 0.0]
         self._pushed_since_ns: int | None = None
         self._pushed_from = (0.0, 0.0, 0.0)
-        self._quickest: tuple[int, int, int] | None = None
+        self._clock: _RobotClock | None = None
         self.rejected = 0
 
     def step(self, report: OdometryInputs) -> Verdict:
@@ -242,14 +257,16 @@ class OdometryGate:
         received_ns, stamp_ns = report.received_ns, report.robot_stamp_ns
         if stamp_ns <= 0:
             return 0
-        offset_ns = received_ns - stamp_ns
-        if self._quickest is not None:
-            at_ns, least_ns, last_ns = self._quickest
-            lag_ns = offset_ns - least_ns - round(CLOCK_DRIFT * (received_ns - at_ns))
-            if 0 < lag_ns <= CLOCK_STEP_NS and stamp_ns > last_ns - CLOCK_BACK_NS:
-                self._quickest = (at_ns, least_ns, max(stamp_ns, last_ns))
+        offset_ns, clock = received_ns - stamp_ns, self._clock
+        if clock is not None:
+            lag_ns = offset_ns - clock.least_ns - round(CLOCK_DRIFT * (received_ns - clock.at_ns))
+            went_back = stamp_ns <= clock.stamp_ns - CLOCK_BACK_NS
+            # Not the lag itself: on a congested link it grows without end, although no clock was set.
+            was_set = went_back or offset_ns - clock.offset_ns > CLOCK_STEP_NS
+            if lag_ns > 0 and not was_set:
+                self._clock = replace(clock, stamp_ns=max(stamp_ns, clock.stamp_ns), offset_ns=offset_ns)
                 return lag_ns
-        self._quickest = (received_ns, offset_ns, stamp_ns)
+        self._clock = _RobotClock(received_ns, offset_ns, stamp_ns, offset_ns)
         return 0
 
 

@@ -58,9 +58,9 @@ class _Gate:
     """Checks whether arming may be requested: nothing may keep the robot from driving."""
 
     def __init__(
-        self, in_the_way: Callable[[], str], operator: bool, clock: Callable[[], int], say: Callable[[str], None]
+        self, obstacle: Callable[[], str], operator: bool, clock: Callable[[], int], say: Callable[[str], None]
     ) -> None:
-        self._in_the_way = in_the_way
+        self._obstacle = obstacle
         self._operator = operator
         self._clock = clock
         self._say = say
@@ -70,7 +70,7 @@ class _Gate:
 
     def is_clear(self, status: BridgeStatus | None) -> bool:
         """Check once. Raises RefusedError when an obstacle remains although the robot may be armed."""
-        now_ns, self.why = self._clock(), self._in_the_way()
+        now_ns, self.why = self._clock(), self._obstacle()
         permitted = not self._operator or (status is not None and status.blocked_by == "none")
         if not self.why or not permitted or self._since_ns is None:
             self._since_ns = now_ns
@@ -90,19 +90,19 @@ def arm(
     stop_requested: Callable[[], bool],
     say: Callable[[str], None],
     on_wait: Callable[[str], None],
-    in_the_way: Callable[[], str] = lambda: "",
+    obstacle: Callable[[], str] = lambda: "",
     operator: bool = False,
     clock: Callable[[], int] = time.monotonic_ns,
     sleep: Callable[[float], None] = time.sleep,
 ) -> int:
-    """Arm, and keep the bridge fed with zeros until it has the robot on its feet; the last sequence number used.
+    """Arm the robot; send zero velocities until the bridge reports `armed`; return the last sequence number.
 
     `limit_s`: for the arming itself; waiting for an operator has no limit. `on_wait(WAITING or ARMING)`: every 50 ms
-    from when that waiting began. `in_the_way()`: what would keep the robot from driving, checked every 50 ms and
-    empty when the bridge is asked; for an `operator` it is waited for as long as there is none. Raises RefusedError,
+    from when that waiting began. `obstacle()`: what blocks arming, empty if nothing, checked every 50 ms; with
+    `operator` it is waited for until it is empty. Raises RefusedError,
     StoppedEarlyError or BridgeUnavailable.
     """
-    gate = _Gate(in_the_way, operator, clock, say)
+    gate = _Gate(obstacle, operator, clock, say)
     while not gate.is_clear(bridge.poll()):
         if stop_requested():
             raise StoppedEarlyError("stopped before the robot was armed")

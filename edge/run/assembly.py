@@ -76,6 +76,19 @@ class Engines:
 
 
 @dataclass(frozen=True)
+class StopEvents:
+    """Request to both loops to end; one event each, so that control never waits for a lock that reasoning has."""
+
+    control: threading.Event = field(default_factory=threading.Event)
+    reasoning: threading.Event = field(default_factory=threading.Event)
+
+    def set(self) -> None:
+        """Request the end of both loops; any thread may call it."""
+        self.control.set()
+        self.reasoning.set()
+
+
+@dataclass(frozen=True)
 class Loops:
     """The threads and monitors of a run, not started yet."""
 
@@ -93,7 +106,7 @@ def assemble(
     sink: CommandTap,
     recorder: RecordSink | None,
     *,
-    stop: threading.Event,
+    stop: StopEvents,
     say: Callable[[str], None],
     on_tick: Callable[[bool], None],
 ) -> Loops:
@@ -130,7 +143,7 @@ def assemble(
         shared,
         ReasoningConfig(runtime.frame_offsets_s, runtime.max_new_tokens, options.mode, switches.decoding),
         options.instruction,
-        stop=stop,
+        stop=stop.reasoning,
         schedule=ReasoningSchedule(
             release_delay_s=options.release_delay.sampler(),
             budget=power.budget,
@@ -169,7 +182,7 @@ def assemble(
         shared,
         CommandChain(Controller(config), Watch(watch, sources), Supervisor()),
         ControlOutputs(sink, recorder, on_tick),
-        stop=stop,
+        stop=stop.control,
     )
     loops.append((control, reasoning))
     pre_arm = PreArm(

@@ -61,8 +61,8 @@ edge-bridge must be running; where the robot file says operator_arm, the robot s
 `edge-bridge arm`. Without --duration it drives until SIGINT or SIGTERM; both stop the robot first.
 exit codes: 0 done (also after SIGTERM), 1 a fault ended the run, no plan was finite, or the
             result could not be written, 2 bad arguments or input, 3 refused to drive,
-            130 interrupted (SIGINT); a hang of reasoning that cannot be interrupted ends the process by SIGKILL,
-            so that its service starts it again
+            130 interrupted (SIGINT); a hang of control or reasoning that cannot be interrupted ends the process
+            by SIGKILL, so that its service starts it again
 """
 
 LINES_S = 1.0
@@ -83,7 +83,7 @@ def parser() -> argparse.ArgumentParser:
         "--mode",
         choices=[mode.value for mode in Mode],
         default=Mode.ASYNC.value,
-        help="sync: halt to think, then drive 0.5 s; no-reasoning: prefill only (default: async)",
+        help="sync: halt during reasoning, then drive 0.5 s; no-reasoning: prefill only (default: async)",
     )
     p.add_argument("--duration", type=float, metavar="S", help="drive for this long (default: until a signal)")
     p.add_argument(

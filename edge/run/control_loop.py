@@ -36,7 +36,7 @@ BRIDGE_SILENCE_NS = 500_000_000
 """Silence of the bridge after which it counts as hung and the run ends, ns; it reports at 10 Hz."""
 URGENT_POLL_S = 0.01
 """Period at which the waiting control thread polls for urgent faults, s."""
-THINKING = "thinking"
+REASONING = "reasoning"
 """Reason for standing in sync mode while a generation is under way."""
 
 OffsetCovariance = Callable[[int], npt.NDArray[np.float64] | None]
@@ -180,8 +180,7 @@ class ControlLoop:
             if self.supervision.stop:
                 self.ended_by = "supervisor"
                 return self.supervision.message
-            status = self._sink.poll()
-            now_ns = self._clock()
+            status, now_ns = self._sink.poll(), self._clock()
             silent_ns = 0 if status is None else now_ns - status.stamp_ns
             if status is not None and (status.state == "stopped" or silent_ns > BRIDGE_SILENCE_NS):
                 return self._ended_by_bridge(status, now_ns)
@@ -205,8 +204,11 @@ class ControlLoop:
     def tick(self, deadline_ns: int) -> VelocityCommand:
         """Run one tick; returns the command that it sent."""
         start_ns = self._clock()
+        # Before each of the two graph calls: after both, the command would be later than the bound of a jump.
+        self.poll_urgent_faults()
         encoded = self._encode(self._sources.newest_frame())
         encoded_ns = self._clock()
+        self.poll_urgent_faults()
         semantic = self._slot.state
         pose = self._sources.history.newest()
         trajectory: npt.NDArray[np.float32] | None = None
@@ -286,7 +288,7 @@ class ControlLoop:
         return command
 
     def poll_urgent_faults(self) -> bool:
-        """Between ticks: act on urgent faults; returns whether they stopped the robot."""
+        """Act on urgent faults, between and within ticks; returns whether they stopped the robot."""
         findings = self._watch.urgent()
         if not findings:
             return False
@@ -336,7 +338,7 @@ class ControlLoop:
             return self.supervision.active[0] if self.supervision.active else "not-supervised"
         until_ns = self._slot.drive_until_ns
         if until_ns is not None and now_ns >= until_ns:
-            return THINKING
+            return REASONING
         if semantic is None or pose is None:
             return None
         return self._recovery.hold(semantic.T_odom_stop, pose.T_odom_base)

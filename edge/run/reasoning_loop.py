@@ -262,7 +262,8 @@ class ReasoningLoop:
         begun_ns = self._ring.newest_ns
         if begun_ns is None:
             raise _MissedFrameError
-        # The shortest of late: expecting too little moves the frame by less than its tolerance, too much is waited for.
+        # The shortest recent prefill: an estimate that is too short shifts the frame by less than its tolerance; with
+        # one that is too long the generation waits.
         prefix_ns = min(self._prefixes_ns, default=0)
         plan = Anchor.after(begun_ns, prefix_ns) if self._late_anchor else Anchor.now(begun_ns)
         prefill_started_ns = self._clock()

@@ -1,4 +1,4 @@
-"""What the runner knows of the robot: its reports through the drift estimator into the pose history, and its camera.
+"""Robot inputs of the runner: reports through the drift estimator into the pose history, and the camera.
 
 Reports are taken in the thread that reads them, pictures in the camera's; the control thread only reads the
 results.

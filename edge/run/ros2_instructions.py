@@ -12,12 +12,14 @@ from typing import Final
 
 from edge.flightlog.records import Throttle
 from edge.reasoning.prompt import InstructionError, check_instruction
-from edge.run.instructions import MAX_A_POLL, MAX_BYTES
+from edge.run.instructions import MAX_BYTES
 from edge.run.stop_phrase import is_stop_phrase
 from firmware_bridge.dds.bus import DDS_ERRORS, take_each
 from firmware_bridge.dds.shared_bus import SharedBus
 from firmware_bridge.ros2.messages.common import String_
 
+DEPTH: Final = 256
+"""Number of samples kept between two polls, 50 ms apart: no stop phrase is lost on a topic of up to 5000 a second."""
 REFUSALS_HZ: Final = 1.0
 """Most lines about refused instructions: a node that floods the topic must not flood the terminal."""
 
@@ -38,33 +40,40 @@ class Ros2Instructions:
         """Whether a stop phrase has been received."""
         self._topic, self._check, self._stop, self._say = topic, check, stop, say
         self._refusals = Throttle(REFUSALS_HZ)
-        self._reader = bus.open().reader(topic, String_, depth=MAX_A_POLL, reliable=True)
+        self._reader = bus.open().reader(topic, String_, depth=DEPTH, reliable=True)
 
     def poll(self) -> str | None:
         """Return the newest valid instruction since the last poll; None without one or after a stop phrase."""
-        newest: str | None = None
-        try:
-            for sample in take_each(self._reader, MAX_A_POLL, MAX_BYTES):
-                try:
-                    text = _text(sample)
-                    if is_stop_phrase(text):
-                        self.stopped, newest = True, None
-                        stands = "the robot stands" if self._stop() else "standstill is not confirmed"
-                        self._say(f"stop phrase on {self._topic}: {stands}")
-                        continue
-                    if self.stopped:
-                        raise InstructionError("a stop phrase has ended this run")
-                    self._check(text)
-                except InstructionError as error:
-                    self._refuse(str(error))
-                    continue
-                newest = text
-        except DDS_ERRORS as error:
-            self._refuse(f"DDS: {error.msg}")
-        return newest
+        texts = self._take()
+        if any(map(is_stop_phrase, texts)):
+            self.stopped = True
+            stands = "the robot stands" if self._stop() else "standstill is not confirmed"
+            self._say(f"stop phrase on {self._topic}: {stands}")
+        elif texts and self.stopped:
+            self._refuse("a stop phrase has ended this run")
+        elif texts:
+            try:
+                self._check(texts[-1])  # this one only: it counts the prompt's tokens
+                return texts[-1]
+            except InstructionError as error:
+                self._refuse(str(error))
+        return None
 
     def close(self) -> None:
         """Do nothing: the bus's owner closes the reader."""
+
+    def _take(self) -> list[str]:
+        """Take all samples that wait; return their instructions in one line each, oldest first."""
+        texts: list[str] = []
+        try:
+            for sample in take_each(self._reader, DEPTH, MAX_BYTES):
+                try:
+                    texts.append(_text(sample))
+                except InstructionError as error:
+                    self._refuse(str(error))
+        except DDS_ERRORS as error:
+            self._refuse(f"DDS: {error.msg}")
+        return texts
 
     def _refuse(self, why: str) -> None:
         if self._refusals.due(time.monotonic_ns()):

@@ -25,7 +25,7 @@ from edge.inference.warm_up import check_tick, open_proven, warm_up
 from edge.reasoning.generation_cycle import Mode
 from edge.reasoning.prompt import InstructionError
 from edge.run.arming import POLL_S, RefusedError, StoppedEarlyError, arm, disarm
-from edge.run.assembly import Engines, Loops, RunOptions, assemble
+from edge.run.assembly import Engines, Loops, RunOptions, StopEvents, assemble
 from edge.run.instructions import InstructionChannels, open_channels
 from edge.run.result import close_log, run_record, run_result
 from edge.run.robot_inputs import CommandTap, RobotInputs
@@ -103,12 +103,12 @@ class RunSession:
         self._lines.extend(warm.notes)
         check_tick(artifacts, warm.tick_ms)
         self._engines = Engines(artifacts, policy, language, self._schedule, activity)
-        self._stop, self._finished = threading.Event(), threading.Event()
+        self._stop, self._finished = StopEvents(), threading.Event()
         self._stop_requested = False
         self._faults: list[str] = []
         self._began = False
         self.hung = False
-        """Whether reasoning hangs in a call that only the end of the process ends."""
+        """Whether a loop hangs in a call that only the end of the process ends."""
 
     def _stop_by(self, bridge: BridgeClient, why: str) -> bool:
         """Stop the robot and end the run; return whether the bridge reports standstill within STANDSTILL_S."""
@@ -162,25 +162,19 @@ class RunSession:
                 ),
             )
             inputs.camera.start()
-            self._await_inputs(inputs, bridge)
+            stop = functools.partial(self._stop_by, bridge)
+            # Each may take 10 s: before the wait, from which on systemd's watchdog may count.
+            views.open(self._options.live, self._robot, functools.partial(stop, LIVE_STOP), self._print)
+            self._await_inputs(inputs, bridge, views)
             if self._options.record is not None:
                 recorder = Recorder(self._options.record)
                 if recorder.error is not None:
                     raise RefusedError(recorder.error)
-            stop = functools.partial(self._stop_by, bridge)
-            views.open(self._options.live, self._robot, functools.partial(stop, LIVE_STOP), self._print)
             records = RecordSinks.of(recorder, views.live, views.ros2)
             loops = self._loops = assemble(
-                self._engines,
-                self._robot,
-                self._options,
-                inputs,
-                sink,
-                records,
-                stop=self._stop,
-                say=self._lines.append,
-                on_tick=self._reporter.on_tick,
-            )
+                self._engines, self._robot, self._options, inputs, sink, records, stop=self._stop,
+                say=self._lines.append, on_tick=self._reporter.on_tick,
+            )  # fmt: skip
             by_phrase, check = functools.partial(stop, STOP_PHRASE), self._engines.language.check_instruction
             say, live = self._lines.append, views.live
             channel = open_channels(self._options, self._robot, self._bus, check, by_phrase, say, live)
@@ -241,11 +235,13 @@ class RunSession:
         faults = f" ({', '.join(supervision.active)})" if supervision.active else ""
         return f"{supervision.state.value}{faults}, {self._loops.reasoning.cycle.published} generations"
 
-    def _await_inputs(self, inputs: RobotInputs, bridge: BridgeClient) -> None:
+    def _await_inputs(self, inputs: RobotInputs, bridge: BridgeClient, views: Views) -> None:
         """Wait for a frame and a pose; without a time limit where an operator arms the robot."""
         waits = self._robot.safety.operator_arm
         deadline, reported = Deadline(READY_TIMEOUT_S), False
         while not inputs.ready:
+            if views.live is not None:
+                views.live.poll()
             if self._stop_requested:
                 raise StoppedEarlyError("stopped before the robot was armed")
             if self._finished.is_set():
@@ -279,7 +275,7 @@ class RunSession:
             self._reporter.on_wait(text)
             self._print_lines()
 
-        def in_the_way() -> str:
+        def obstacle() -> str:
             if self._finished.is_set():
                 raise RefusedError(self._faults[0])
             return loops.pre_arm.blocking_fault()
@@ -290,7 +286,7 @@ class RunSession:
             stop_requested=stop_requested,
             say=self._print,
             on_wait=on_wait,
-            in_the_way=in_the_way,
+            obstacle=obstacle,
             operator=self._robot.safety.operator_arm,
         )
 
@@ -332,6 +328,7 @@ class RunSession:
             thread.join(join.left_s())
             if thread.is_alive():
                 self._faults.append(f"the {thread.name} thread did not end within {JOIN_S:g} s")
+                self.hung = self.hung or thread.name == "control"
         return end
 
     def _guard(
@@ -355,28 +352,29 @@ class RunSession:
 
     def _hold(self, commands: CommandTap) -> None:
         """Keep the robot at rest while a command of the control thread is late."""
-        enter(self._schedule.control)
+        enter(self._schedule.late_command)
         hold_while_late(commands, self._finished)
 
     def _watch_run(self, loops: Loops, inputs: RobotInputs, channel: InstructionChannels | None) -> None:
-        """Forward lines and instructions and watch reasoning until a thread has ended or a stop is requested."""
+        """Forward lines and instructions and watch reasoning until a thread has ended or a stop is requested.
+
+        Once reasoning was given up, it waits JOIN_S for the control thread, which may hang as well.
+        """
         reasoning, message, watch = loops.reasoning, "", ReasoningWatch()
-        while not self._finished.wait(POLL_S):
-            if self._stop_requested:
-                self._stop.set()
+        end: Deadline | None = None
+        while not (self._finished.wait(POLL_S) or self._stop_requested or (end is not None and end.left_s() <= 0)):
             if loops.control.supervision.message != message:
                 message = loops.control.supervision.message
                 self._print(message or "all faults have cleared")
             self._print_lines()
             self._take_instructions(channel, loops)
-            hang = watch.step(
-                reasoning.last_progress_ns, reasoning.times.generation_ms.quantile(1.0), time.monotonic_ns()
-            )
+            longest_ms = reasoning.times.generation_ms.quantile(1.0)
+            hang = watch.step(reasoning.last_progress_ns, longest_ms, time.monotonic_ns())
             if hang is Hang.INTERRUPT:
                 self._print(f"reasoning has been in one call for {watch.hung_s:.0f} s; it is interrupted")
                 reasoning.cancel()
             elif hang is Hang.GIVE_UP and not self.hung:
-                self.hung = True
+                self.hung, end = True, Deadline(JOIN_S)
                 inputs.findings.put((Finding("reasoning-hung", f"for {watch.hung_s:.0f} s"),))
 
     def _halt(self, bridge: BridgeClient, end: Deadline) -> BridgeStatus | None:

@@ -1,4 +1,4 @@
-"""What shows a run to others while it drives: a live view and a ROS 2 node, each fed without waiting."""
+"""Feeds a run's live view and its ROS 2 node without waiting."""
 
 from __future__ import annotations
 

@@ -37,8 +37,9 @@ class PreArm:
 
     def blocking_fault(self) -> str:
         """Return the worst fault that would keep the robot from moving, for the operator; empty: none."""
-        now_ns = self._clock()
-        findings = self._watch.standing(self._picture(), self._pose(), now_ns)
+        picture, pose = self._picture(), self._pose()
+        now_ns = self._clock()  # read last: a newer pose would have a negative age, which is a fault
+        findings = self._watch.standing(picture, pose, now_ns)
         outputs = self._supervisor.step(SupervisorInputs(findings, armed=False), now_ns)
         if outputs.stop:
             # The robot is not armed, so nothing latches: start over.

@@ -13,7 +13,7 @@ from edge.core.geometry import SE2
 Floats = npt.NDArray[np.float32]
 
 TOLERANCE_S = 0.5
-"""Largest distance of a frame's stamp from the requested instant, ns."""
+"""Largest distance of a frame's stamp from the requested instant, s."""
 
 
 @dataclass(frozen=True)

@@ -86,7 +86,7 @@ class RobotMonitor:
     def __init__(self, config: RobotWatchConfig) -> None:
         self._config = config
         self._malformed = 0
-        self._counts: deque[tuple[int, int]] = deque(maxlen=64)
+        self._counts: deque[tuple[int, int]] = deque()
         self._expected: float | None = None
 
     def begin(self, malformed: int) -> None:

@@ -19,7 +19,7 @@ from edge.inference.graph import CancelledError, Graph, GraphError, Interrupt
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
 from edge.inference.scheduling import Role, Schedule, TickActivity, schedule_for
-from edge.state.semantic import SemanticState
+from edge.state.semantic import Context, SemanticState
 
 HERE = SE2(0.0, 0.0, 0.0)
 
@@ -146,21 +146,43 @@ def test_a_semantic_context_can_be_interrupted(policy: Policy, artifacts: Artifa
         policy.semantic_context(np.zeros((1, 8, artifacts.runtime.kv_dim), dtype=np.float32), interrupt)
 
 
+class Spy(TickActivity):
+    """Records the calls of a tick."""
+
+    def __init__(self) -> None:
+        super().__init__(100_000_000)
+        self.seen: list[str] = []
+
+    def begin(self, now_ns: int) -> None:
+        self.seen.append("begin")
+
+    def end(self, now_ns: int) -> None:
+        self.seen.append("end")
+
+
 def test_a_computing_tick_is_visible_to_other_threads(artifacts: Artifacts) -> None:
-    seen: list[str] = []
-
-    class Spy(TickActivity):
-        def begin(self, now_ns: int) -> None:
-            seen.append("begin")
-
-        def end(self, now_ns: int) -> None:
-            seen.append("end")
-
-    policy = Policy(artifacts, threads=1, activity=Spy(100_000_000))
+    spy = Spy()
+    policy = Policy(artifacts, threads=1, activity=spy)
     policy.semantic_context(np.zeros((1, 8, artifacts.runtime.kv_dim), dtype=np.float32))
-    assert seen == []
+    assert spy.seen == []
     policy.encode(picture(1))
-    assert seen == ["begin", "end"]
+    assert spy.seen == ["begin", "end"]
+
+
+def test_a_context_from_waypoints_is_a_call_of_the_tick(artifacts: Artifacts) -> None:
+    """Else reasoning would take the accelerator between the two calls of a tick."""
+    spy = Spy()
+    policy = Policy(artifacts, threads=1, activity=spy)
+    state = dataclasses.replace(semantic(policy, artifacts, 1), waypoints=((1.0, 0.0), (2.0, 0.0)))
+
+    def make_context(feeds: Context, interrupt: Interrupt | None = None) -> Context:
+        spy.seen.extend(feeds)
+        return state.context
+
+    policy.guided_by_waypoints = True
+    policy.make_context = make_context  # type: ignore[method-assign]
+    policy.act(np.zeros(policy.tokens_shape, dtype=np.float32), (0.0, 0.0, 0.0), 0.0, HERE, state)
+    assert spy.seen == ["begin", "waypoints", "end", "begin", "end"]
 
 
 def test_a_graphs_own_workers_run_on_the_roles_cores(artifacts: Artifacts) -> None:
@@ -180,7 +202,7 @@ def test_artifacts_with_cores_of_their_own_make_a_schedule(
     runtime = dataclasses.replace(artifacts.runtime, control_cores=(7,), reasoning_cores=(5, 6), control_priority=40)
     monkeypatch.setattr(scheduling, "priority_refusal", lambda _priority: None)
     made = schedule_for(dataclasses.replace(artifacts, runtime=runtime), allowed=range(8))
-    assert (made.control.cores, made.control.priority) == ((7,), 40)
+    assert (made.control.cores, made.control.priority) == ((7,), 39)
     assert (made.reasoning.cores, made.reasoning.priority, made.shared) == ((5, 6), 20, False)
     assert schedule_for(artifacts, allowed={0}).shared
 
@@ -189,7 +211,8 @@ def test_the_language_models_workers_have_a_role_of_their_own(artifacts: Artifac
     """Else they would be as urgent as the control thread, whatever the thread that calls them is."""
     core = min(os.sched_getaffinity(0))
     workers_role = Role("workers", cores=(core,), niceness=17)
-    schedule = Schedule(Role("control"), Role("inputs"), Role("reasoning"), workers_role, shared=False)
+    control, late_command, inputs, reasoning = map(Role, ("control", "late-command", "inputs", "reasoning"))
+    schedule = Schedule(control, late_command, inputs, reasoning, workers_role, shared=False)
     tasks = Path("/proc/self/task")
     before = {path.name for path in tasks.iterdir()}
     language = LanguageModel(artifacts, threads=2, schedule=schedule)

@@ -184,7 +184,7 @@ class TestInterpreter:
     """Who takes the interpreter's lock must not wait for other programs: the control thread would wait with it."""
 
     @pytest.mark.parametrize(
-        ("control", "others"),
+        ("priority", "others"),
         [
             (None, [None, None, None]),
             (50, [40, 31, 30]),
@@ -195,11 +195,23 @@ class TestInterpreter:
         ],
     )
     def test_reasoning_is_below_all_and_its_graphs_threads_above_it(
-        self, control: int | None, others: list[int | None]
+        self, priority: int | None, others: list[int | None]
     ) -> None:
-        made = schedule(range(4), priority=control)
-        assert made.control.priority == control
+        made = schedule(range(4), priority=priority)
+        assert made.late_command.priority == priority
         assert [role.priority for role in (made.inputs, made.workers, made.reasoning)] == others
+
+    @pytest.mark.parametrize(("priority", "control"), [(None, None), (59, 58), (50, 49), (2, 1), (1, 1)])
+    def test_the_late_command_thread_is_above_control_and_has_the_services_highest_priority(
+        self, priority: int | None, control: int | None
+    ) -> None:
+        """The unit's LimitRTPRIO is the target's control_priority, and the bridge's is above it."""
+        made = schedule(range(4), control=(3,), priority=priority)
+        assert (made.control.priority, made.late_command.priority) == (control, priority)
+
+    def test_the_late_command_thread_is_not_bound_to_the_core_of_the_tick_that_it_covers(self) -> None:
+        made = schedule(range(4), control=(3,))
+        assert (made.control.cores, made.late_command.cores) == ((3,), ())
 
     def test_without_cores_of_its_own_reasoning_fills_one_core_at_most(self) -> None:
         made = schedule(range(2))
@@ -210,12 +222,13 @@ class TestInterpreter:
     ) -> None:
         Policies(monkeypatch, refused=True)
         made = schedule_for(artifacts)
-        assert [role.priority for role in (made.control, made.inputs, made.workers, made.reasoning)] == [None] * 4
+        roles = (made.control, made.late_command, made.inputs, made.workers, made.reasoning)
+        assert [role.priority for role in roles] == [None] * 5
         assert "LimitRTPRIO=50" in made.notes[-1]
 
     def test_where_it_is_permitted_nothing_is_said(self, artifacts: Artifacts, monkeypatch: pytest.MonkeyPatch) -> None:
         policies = Policies(monkeypatch)
-        assert schedule_for(artifacts).control.priority == 50 and not schedule_for(artifacts).notes
+        assert schedule_for(artifacts).late_command.priority == 50 and not schedule_for(artifacts).notes
         assert {(policy, priority) for _, policy, priority in policies.set} == {(os.SCHED_FIFO, 50)}
 
     def test_preparing_gives_all_python_threads_a_priority_that_their_processes_do_not_inherit(

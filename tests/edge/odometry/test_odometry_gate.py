@@ -119,6 +119,29 @@ def test_a_robots_clock_that_is_set_back_is_not_lag(ahead_s: int) -> None:
     assert all(v.increment is not None for v in verdicts[1:])
 
 
+def delayed(index: int, delay_ms: int) -> OdometryInputs:
+    """A report of a robot that stands, with its clock's stamp, `delay_ms` later than it could come."""
+    stamp_ns = (index + 1) * STEP_NS
+    return report(index, robot_stamp_ns=stamp_ns + 10**9, received_ns=stamp_ns + delay_ms * 1_000_000)
+
+
+def test_reports_whose_delay_grows_to_ten_seconds_are_stale_all_the_time() -> None:
+    """On a congested link, 10 ms a report."""
+    verdicts = feed([delayed(i, 10 * i) for i in range(1000)])
+    assert all(names(v) == ["odometry-stale"] for v in verdicts[26:])
+
+
+def test_reports_that_are_still_late_after_a_delay_has_shrunk_are_stale() -> None:
+    verdicts = feed([*[delayed(i, 10 * i) for i in range(1000)], *[delayed(i, 3000) for i in range(1400, 1450)]])
+    assert all(names(v) == ["odometry-stale"] for v in verdicts[1000:])
+
+
+def test_a_robots_clock_that_is_set_back_during_a_silence_is_not_lag() -> None:
+    """The robot restarts for 10 s, and its clock goes on 2 s after its last stamp."""
+    verdicts = feed([*[delayed(i, 0) for i in range(50)], *[delayed(i, 8000) for i in range(150, 200)]])
+    assert all(not v.findings for v in verdicts)
+
+
 @pytest.mark.parametrize("ppm", [-90, 90])
 def test_a_robots_clock_that_runs_a_little_fast_or_slow_is_no_delay(ppm: int) -> None:
     reports = [

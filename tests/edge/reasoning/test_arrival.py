@@ -176,4 +176,4 @@ def test_standing_to_think_comes_before_having_arrived() -> None:
     bench.think(stop=SE2(bench.walked_m, 0.0, 0.0))
     bench.slot.drive_until_ns = 0
     bench.see()
-    assert bench.tick() == (0.0, "thinking")
+    assert bench.tick() == (0.0, "reasoning")

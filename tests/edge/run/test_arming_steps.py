@@ -35,7 +35,7 @@ class FakeBridge:
         self.slept_s: list[float] = []
         self.said: list[str] = []
         self.waited: list[str] = []
-        self.in_the_way: Callable[[float], str] = lambda _ms: ""
+        self.obstacle: Callable[[float], str] = lambda _ms: ""
 
     @property
     def ms(self) -> float:
@@ -64,7 +64,7 @@ class FakeBridge:
     def run(self, **options: Any) -> int:
         return arm(
             self, limit_s=12.0, stop_requested=lambda: False, say=self.said.append, on_wait=self.waited.append,
-            in_the_way=lambda: self.in_the_way(self.ms), clock=lambda: self.now_ns, sleep=self.sleep, **options,
+            obstacle=lambda: self.obstacle(self.ms), clock=lambda: self.now_ns, sleep=self.sleep, **options,
         )  # fmt: skip
 
     def disarm(self, limit_s: float = 2.0) -> bool:
@@ -143,35 +143,35 @@ class TestWaitingForAnOperator:
 class TestInTheWay:
     def test_an_obstacle_of_six_seconds_is_waited_for_and_a_longer_one_is_not(self) -> None:
         bridge = FakeBridge(lambda ms: stands_up(ms - 6050))
-        bridge.in_the_way = lambda ms: "dark" if ms <= 6000 else ""
+        bridge.obstacle = lambda ms: "dark" if ms <= 6000 else ""
         assert bridge.run() > 0
         bridge = FakeBridge(stands_up)
-        bridge.in_the_way = lambda ms: "dark" if ms <= 6050 else ""
+        bridge.obstacle = lambda ms: "dark" if ms <= 6050 else ""
         with pytest.raises(RefusedError, match="not armed: dark"):
             bridge.run()
         assert bridge.ms == 6050.0
 
     def test_without_an_operator_nobody_is_told_that_it_waits(self) -> None:
         bridge = FakeBridge(lambda ms: stands_up(ms - 1000))
-        bridge.in_the_way = lambda ms: "dark" if ms < 1000 else ""
+        bridge.obstacle = lambda ms: "dark" if ms < 1000 else ""
         bridge.run()
         assert bridge.waited == []
 
     def test_for_an_operator_each_turn_names_the_obstacle(self) -> None:
         bridge = FakeBridge(lambda ms: stands_up(ms - 1000))
-        bridge.in_the_way = lambda ms: "dark" if ms < 1000 else ""
+        bridge.obstacle = lambda ms: "dark" if ms < 1000 else ""
         bridge.run(operator=True)
         assert bridge.waited == ["waiting to be armed (dark)"] * 20
 
     def test_each_obstacle_is_reported_once_until_another_one_comes(self) -> None:
         bridge = FakeBridge(lambda ms: stands_up(ms - 3000))
-        bridge.in_the_way = lambda ms: "" if ms >= 3000 else "late" if 1000 <= ms < 2000 else "dark"
+        bridge.obstacle = lambda ms: "" if ms >= 3000 else "late" if 1000 <= ms < 2000 else "dark"
         bridge.run()
         assert bridge.said == [f"not armed yet: {why}" for why in ("dark", "late", "dark")]
 
     def test_an_obstacle_is_no_reason_to_wait_longer_unless_an_operator_arms(self) -> None:
         bridge = FakeBridge(lambda ms: status(ms, blocked_by="operator"))
-        bridge.in_the_way = lambda _ms: "dark"
+        bridge.obstacle = lambda _ms: "dark"
         with pytest.raises(RefusedError, match="not armed: dark"):
             bridge.run()
 

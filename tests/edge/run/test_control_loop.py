@@ -113,7 +113,7 @@ def test_the_robot_stands_while_it_thinks_in_a_mode_that_takes_turns(bench: Benc
     bench.drive()
     bench.slot.drive_until_ns = bench.now_ns
     bench.see()
-    assert bench.tick() == (0.0, "thinking")
+    assert bench.tick() == (0.0, "reasoning")
     bench.slot.drive_until_ns = bench.now_ns + PERIOD_NS
     bench.see()
     assert bench.tick()[1] == "ok"

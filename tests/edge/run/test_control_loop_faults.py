@@ -18,6 +18,7 @@ import pytest
 from edge.core.geometry import SE2
 from edge.run.control_loop import ControlStatistics
 from edge.run.result import plan_fault
+from edge.safety.faults.findings import Finding
 from edge.safety.faults.table import FAULTS
 from edge.safety.monitors.semantic import SemanticConfig
 from edge.state.pose_history import StampedPose
@@ -305,6 +306,42 @@ def test_a_thousand_texts_leave_every_limit_as_it_is(bench: Bench) -> None:
         speed, turn_rate = bench.sink.commands[-1][1:]
         assert 0 <= speed <= LIMITS.vx_max_mps and abs(turn_rate) <= LIMITS.wz_max_radps
     assert bits() == before
+
+
+# Between the calls of a tick
+
+
+def speeds_at_calls(bench: Bench, *, during_encode: bool) -> list[float]:
+    """The speed in force at each graph call of a tick; a jump of the pose is found before the first or during it."""
+    speeds: list[float] = []
+    jump = (Finding("odometry-jump"),)
+    encode, act = bench.policy.encode, bench.policy.act
+
+    def encoding(frame: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+        speeds.append(bench.sink.commands[-1][1])
+        if during_encode:
+            bench.findings.put(jump)
+        return encode(frame, out)
+
+    def acting(*inputs: object) -> np.ndarray:
+        speeds.append(bench.sink.commands[-1][1])
+        return act(*inputs)  # type: ignore[arg-type]
+
+    bench.policy.encode, bench.policy.act = encoding, acting  # type: ignore[method-assign]
+    bench.see()
+    if not during_encode:
+        bench.findings.put(jump)
+    bench.tick()
+    return speeds
+
+
+def test_a_jump_before_a_tick_stops_the_robot_before_its_first_graph_call(bench: Bench) -> None:
+    assert speeds_at_calls(bench, during_encode=False) == [0.0, 0.0]
+
+
+def test_a_jump_during_the_encoder_stops_the_robot_before_the_action_expert(bench: Bench) -> None:
+    assert speeds_at_calls(bench, during_encode=True) == [FULL, 0.0]
+    assert bench.sink.commands[-1][1] == 0.0
 
 
 # Machine

@@ -138,7 +138,7 @@ class Runner:
     bench: Bench = field(default_factory=bench_of)
     at_ms: dict[int, Callable[[], object]] = field(default_factory=dict)
     deaf: bool = False
-    in_the_way: str = ""
+    obstacle: str = ""
     asked_ms: list[int] = field(default_factory=list)
     said: list[str] = field(default_factory=list)
     waited: list[str] = field(default_factory=list)
@@ -179,7 +179,7 @@ class Runner:
             stop_requested=lambda: self.stop,
             say=self.said.append,
             on_wait=self.waited.append,
-            in_the_way=lambda: self.in_the_way,
+            obstacle=lambda: self.obstacle,
             operator=self.bench.safety.operator_arm,
             clock=lambda: self.bench.now_ns,
             sleep=self.sleep,
@@ -189,7 +189,7 @@ class Runner:
         self.bench.step(operator=(Arm(),))
 
     def clear(self) -> None:
-        self.in_the_way = ""
+        self.obstacle = ""
 
 
 class TestRunner:
@@ -214,7 +214,7 @@ class TestRunner:
         assert runner.waited == sorted(runner.waited, key=(WAITING, ARMING).index)
         assert len(runner.waited) >= 0.9 * runner.now_ms / 50
 
-    def test_nothing_else_that_is_in_the_way_ends_the_waiting(self) -> None:
+    def test_no_obstacle_ends_the_waiting(self) -> None:
         runner = Runner()
         carried = {"pitch_rad": 1.0}
         runner.at_ms = {
@@ -239,10 +239,10 @@ class TestRunner:
             runner.run()
 
     @pytest.mark.parametrize(
-        ("in_the_way", "when"), [("", "waiting to be armed"), ("dark", "before the robot was armed")]
+        ("obstacle", "when"), [("", "waiting to be armed"), ("dark", "before the robot was armed")]
     )
-    def test_a_signal_ends_the_waiting(self, in_the_way: str, when: str) -> None:
-        runner = Runner(in_the_way=in_the_way)
+    def test_a_signal_ends_the_waiting(self, obstacle: str, when: str) -> None:
+        runner = Runner(obstacle=obstacle)
         runner.at_ms[5_000] = lambda: setattr(runner, "stop", True)
         with pytest.raises(StoppedEarlyError, match=when):
             runner.run()
@@ -272,7 +272,7 @@ class TestInTheWay:
     """What the runner itself finds before arming; the bridge does not know of it."""
 
     def test_a_lasting_obstacle_is_a_refusal_before_the_bridge_is_asked(self) -> None:
-        runner = Runner(Bench(), in_the_way="There is no new picture.")
+        runner = Runner(Bench(), obstacle="There is no new picture.")
         with pytest.raises(RefusedError, match="not armed: There is no new picture"):
             runner.run()
         assert runner.asked_ms == []
@@ -281,7 +281,7 @@ class TestInTheWay:
     def test_it_is_a_refusal_too_while_the_bridge_has_a_reason_of_its_own(self) -> None:
         bench = Bench(battery=3)
         bench.step()
-        runner = Runner(bench, in_the_way="dark")
+        runner = Runner(bench, obstacle="dark")
         with pytest.raises(RefusedError, match="not armed: dark"):
             runner.run()
 
@@ -289,7 +289,7 @@ class TestInTheWay:
         runner = Runner()
 
         def permit_in_the_dark() -> None:
-            runner.in_the_way = "dark"
+            runner.obstacle = "dark"
             runner.permit()
 
         runner.at_ms[2_100] = permit_in_the_dark
@@ -298,14 +298,14 @@ class TestInTheWay:
         assert 8_000 <= runner.now_ms <= 9_000 and runner.said[-1] == "not armed yet: dark"
 
     def test_a_transient_obstacle_is_waited_for(self) -> None:
-        runner = Runner(Bench(), in_the_way="dark")
+        runner = Runner(Bench(), obstacle="dark")
         runner.at_ms[4_000] = runner.clear
         runner.run()
         assert runner.bench.status.state == "armed" and runner.asked_ms[0] >= 4_000
 
     @pytest.mark.slow
     def test_before_an_operators_arm_it_may_last_for_hours(self) -> None:
-        runner = Runner(in_the_way="dark")
+        runner = Runner(obstacle="dark")
         runner.at_ms = {3_600_000: runner.clear, 3_610_000: runner.permit}
         runner.run()
         assert runner.bench.status.state == "armed"
@@ -314,7 +314,7 @@ class TestInTheWay:
     def test_an_operators_arm_is_not_kept_until_it_goes(self) -> None:
         runner = Runner()
         runner.at_ms = {
-            60_000: lambda: setattr(runner, "in_the_way", "dark"),
+            60_000: lambda: setattr(runner, "obstacle", "dark"),
             90_000: runner.permit,
             95_000: runner.clear,
             120_000: runner.permit,

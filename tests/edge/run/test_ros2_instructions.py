@@ -34,11 +34,16 @@ class Rig:
 
     bus: SharedBus
     lines: list[str] = field(default_factory=list)
+    checked: list[str] = field(default_factory=list)
     stops: int = 0
 
     def __post_init__(self) -> None:
-        self.channel = Ros2Instructions(self.bus, TOPIC, refuse_long, self._stop, self.lines.append)
+        self.channel = Ros2Instructions(self.bus, TOPIC, self._check, self._stop, self.lines.append)
         self._writer = self.bus.open().writer(TOPIC, String_, depth=8)
+
+    def _check(self, text: str) -> None:
+        self.checked.append(text)
+        refuse_long(text)
 
     def _stop(self) -> bool:
         self.stops += 1
@@ -110,6 +115,18 @@ def test_a_stop_phrase_stops_the_robot_and_ends_the_channel(rig: Rig) -> None:
     rig.send("walk to the door")
     assert rig.taken(lambda: len(rig.lines) > 1) is None
     assert "a stop phrase has ended this run" in rig.lines[1]
+
+
+def test_a_stop_phrase_is_not_lost_among_a_hundred_later_texts(rig: Rig) -> None:
+    rig.send("stop", *(f"turn left {index}" for index in range(100)))
+    assert rig.taken(lambda: rig.channel.stopped) is None
+    assert rig.stops == 1 and rig.checked == []
+
+
+def test_of_a_hundred_texts_only_the_newest_is_checked_for_the_model(rig: Rig) -> None:
+    rig.send(*(f"turn left {index}" for index in range(100)))
+    assert rig.taken() == "turn left 99"
+    assert rig.checked == ["turn left 99"]
 
 
 def test_any_bytes_are_an_instruction_or_a_refusal(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:

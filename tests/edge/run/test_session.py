@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -22,8 +22,9 @@ from edge.reasoning.generation_cycle import Mode
 from edge.run import assembly
 from edge.run import session as module
 from edge.run.arming import RefusedError, StoppedEarlyError
-from edge.run.assembly import Loops, RunOptions
+from edge.run.assembly import Loops, RunOptions, StopEvents
 from edge.run.session import RunSession
+from edge.safety.watchdog import Hang
 from edge.state.switches import Switches
 from firmware_bridge.client import BridgeUnavailable
 from firmware_bridge.core.config import load_robot_config
@@ -53,7 +54,7 @@ class Rig:
         self.waited: set[str] = set()
         self.on_death: Callable[[str], None] = lambda _why: None
         self.session: RunSession
-        self.stop_flag: threading.Event
+        self.stop_flag: StopEvents
         fakes: dict[str, Any] = {
             "open_proven": lambda *_args, **_named: SimpleNamespace(
                 policy=None,
@@ -62,7 +63,10 @@ class Rig:
                 guard=SimpleNamespace(stage=lambda *_: nullcontext()),
             ),
             "schedule_for": lambda _artifacts: SimpleNamespace(
-                notes=(), inputs=Role("inputs", priority=self.priority), control=None
+                notes=(),
+                inputs=Role("inputs", priority=self.priority),
+                control=Role("control"),
+                late_command=Role("late-command"),
             ),
             "warm_up": lambda *_: WarmUp(1.0, ()),
             "check_tick": lambda *_: None,
@@ -129,6 +133,7 @@ class Rig:
         class Inputs:
             camera = SimpleNamespace(last_error="", start=lambda: None, align=lambda _ns: None)
             history = SimpleNamespace(newest=lambda: None)
+            findings = SimpleNamespace(put=lambda _found: None)
             recorder: object = None
 
             @property
@@ -143,16 +148,16 @@ class Rig:
 
         return Inputs()
 
-    def _assemble(self, *_args: object, stop: threading.Event, **_named: object) -> Any:
+    def _assemble(self, *_args: object, stop: StopEvents, **_named: object) -> Any:
         self.stop_flag = stop
         power = SimpleNamespace(start=lambda: None, close=lambda: None, statistics=dict)
         supervision = SimpleNamespace(message="", active=(), state=SimpleNamespace(value="ok"))
         control = SimpleNamespace(run=lambda *_: self.control(), supervision=supervision, ended_by="test")
         reasoning = SimpleNamespace(
-            run=lambda: stop.wait(20),
+            run=lambda: stop.reasoning.wait(20),
             cancel=lambda: None,
             last_progress_ns=time.monotonic_ns(),
-            generation_ms=SimpleNamespace(quantile=lambda _share: 0.0),
+            times=SimpleNamespace(generation_ms=SimpleNamespace(quantile=lambda _share: 0.0)),
             generations=0,
         )
         return Loops(power, control, reasoning, SimpleNamespace(blocking_fault=lambda: ""))  # type: ignore[arg-type]
@@ -202,7 +207,68 @@ def test_what_reads_the_robot_has_a_priority_that_its_librarys_threads_inherit(m
     assert taken == [(opened_in[0], os.SCHED_FIFO, 40)]
 
 
+def test_a_late_command_is_covered_by_a_thread_above_the_control_thread(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    roles: dict[str, Role] = {}
+    entered = threading.Event()
+
+    def enter(role: Role) -> list[str]:
+        roles[threading.current_thread().name] = role
+        if "late-command" in roles:
+            entered.set()
+        return []
+
+    monkeypatch.setattr(module, "enter", enter)
+    rig.on_arm, rig.control = lambda: 7, lambda: assert_set(entered)
+    assert rig.run()["faults"] == []
+    assert {thread: role.name for thread, role in roles.items()} == {
+        "control": "control",
+        "late-command": "late-command",
+    }
+
+
+def assert_set(event: threading.Event) -> None:
+    assert event.wait(20)
+
+
 # Waiting for the robot
+
+
+class FakeViews:
+    """Views of a run that note when they open; a poll of the live one calls `on_poll`."""
+
+    ros2 = None
+
+    def __init__(self, order: list[str], on_poll: Callable[[], None] = lambda: None) -> None:
+        self._order = order
+        self.live = SimpleNamespace(poll=on_poll, put=lambda *_: None)
+
+    def open(self, *_: object) -> None:
+        self._order.append("views")
+
+    def close(self) -> None:
+        pass
+
+
+def test_views_open_before_the_wait_from_which_on_the_watchdog_counts(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    order: list[str] = []
+    monkeypatch.setattr(module, "Views", lambda: FakeViews(order))
+    monkeypatch.setattr(module, "open_channels", lambda *_: None)
+    monkeypatch.setattr(rig, "on_wait", order.append)
+    rig.ready_s = 300.0
+    with pytest.raises(ArmedError):
+        rig.run(OPERATOR_ROBOT)
+    assert order[0] == "views" and len(order) > 1 and "views" not in order[1:]
+
+
+def test_the_live_views_stop_ends_the_waiting_for_the_robot(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "Views", lambda: FakeViews([], lambda: rig.session.request_stop()))
+    rig.ready_s = 300.0
+    with pytest.raises(StoppedEarlyError):
+        rig.run(OPERATOR_ROBOT)
 
 
 def test_a_robot_that_boots_in_five_minutes_is_waited_for_where_an_operator_arms_it(rig: Rig) -> None:
@@ -255,11 +321,44 @@ def test_an_input_thread_that_dies_ends_the_run(rig: Rig) -> None:
 
     def die() -> None:
         rig.on_death("camera thread died: OSError: gone")
-        stopped.append(rig.stop_flag.wait(20))
+        stopped.append(rig.stop_flag.control.wait(20))
 
     rig.on_arm, rig.control = lambda: 7, die
     assert rig.run()["faults"] == ["camera thread died: OSError: gone"]
     assert stopped == [True]
+
+
+@pytest.fixture
+def released() -> Iterator[threading.Event]:
+    """What a thread that hangs waits for."""
+    event = threading.Event()
+    yield event
+    event.set()
+
+
+def test_a_requested_stop_ends_the_run_although_the_control_thread_hangs(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, released: threading.Event
+) -> None:
+    def hang() -> None:
+        rig.session.request_stop()
+        released.wait(20)
+
+    monkeypatch.setattr(module, "JOIN_S", 0.1)
+    rig.on_arm, rig.control = lambda: 7, hang
+    assert rig.run()["faults"] == ["the control thread did not end within 0.1 s"]
+    assert rig.session.hung, "only SIGKILL ends the process"
+
+
+def test_a_run_whose_two_threads_hang_ends(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, released: threading.Event
+) -> None:
+    """Nobody requests a stop: the reasoning thread was given up, and the control thread does not answer to that."""
+    watch = SimpleNamespace(step=lambda *_: Hang.GIVE_UP, hung_s=30.0)
+    monkeypatch.setattr(module, "ReasoningWatch", lambda: watch)
+    monkeypatch.setattr(module, "JOIN_S", 0.0)
+    rig.on_arm, rig.control = lambda: 7, lambda: assert_set(released)
+    assert "the control thread did not end within 0 s" in rig.run()["faults"]
+    assert rig.session.hung
 
 
 # What the monitors are told

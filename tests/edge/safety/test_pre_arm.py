@@ -8,6 +8,8 @@ from edge.safety.faults.findings import Finding
 from edge.safety.monitors.watch import Sources, Watch, WatchConfig
 from edge.safety.pre_arm import PreArm
 from edge.safety.supervisor import State
+from edge.state.frame import Frame
+from edge.state.pose_history import StampedPose
 from tests.support.runner.control_bench import MS, PERIOD_NS, PX, Bench
 
 
@@ -16,7 +18,7 @@ class Desk:
 
     def __init__(self) -> None:
         self.bench = Bench()
-        watch = Watch(
+        self.watch = watch = Watch(
             WatchConfig.standard(self.bench.controller_config, PERIOD_NS, image_px=PX),
             Sources(
                 findings=self.bench.findings,
@@ -51,6 +53,28 @@ def desk() -> Desk:
 
 def test_with_pictures_and_poses_it_is_ready(desk: Desk) -> None:
     assert (desk.run(3), desk.pre_arm.state) == ("", State.READY)
+
+
+def test_a_picture_and_a_pose_that_arrive_during_the_check_are_no_fault(desk: Desk) -> None:
+    bench = desk.bench
+
+    def arrive() -> None:
+        bench.now_ns += MS
+        bench.see()
+
+    def picture() -> Frame | None:
+        arrive()
+        return bench.frame
+
+    def pose() -> StampedPose | None:
+        arrive()
+        return bench.history.newest()
+
+    pre_arm = PreArm(desk.watch, picture=picture, pose=pose, clock=lambda: bench.now_ns)
+    for _ in range(60):
+        bench.now_ns += 50 * MS
+        why = pre_arm.blocking_fault()
+    assert why == ""
 
 
 def test_without_a_picture_it_is_starting(desk: Desk) -> None:

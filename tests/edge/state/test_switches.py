@@ -110,7 +110,7 @@ def reasons_at_a_standstill(switches: Switches) -> set[str]:
 
 
 def test_without_recovery_only_the_plan_moves_the_robot() -> None:
-    assert "turning-to-words" in reasons_at_a_standstill(Switches())
+    assert "turning-to-waypoints" in reasons_at_a_standstill(Switches())
     assert reasons_at_a_standstill(Switches(CONSTRAINED, OFF, False)) == {"ok"}
 
 
