@@ -1,1 +1,1 @@
-"""What reports of every tool share: HTML pages, the style of plots, progress lines and TOML text."""
+"""HTML pages, plot style and progress display of all reports."""
