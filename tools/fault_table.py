@@ -12,9 +12,8 @@ from edge.safety.faults.table import FAULTS, NOT_HERE, Action, Fault
 HEAD = """# What can go wrong
 
 Made from `edge/safety/faults/table.py` by `python -m tools.fault_table`; do not edit.
-*Row* is the row of the project's fault
-matrix. *Bound* runs from the fault's effect at our input to the velocity on the wire. The bound of `camera-frozen`
-holds for pictures that are equal byte for byte. A scene that stays the same under noise, a clock or a new JPEG
+*Row* is the number that code, tests and the soak's budget name as the fault matrix's row.
+*Bound* runs from the fault's effect at our input to the velocity on the wire. The bound of `camera-frozen` holds for pictures that are equal byte for byte. A scene that stays the same under noise, a clock or a new JPEG
 encoding is found by distance, after about 0.25 m or 12° of motion. The actions:
 
 * **nothing**: control must not change; the fault is dropped or counted.

@@ -1,4 +1,4 @@
-"""The artifact directory's manifest: verified before anything in the directory is opened (design §5)."""
+"""The artifact directory's manifest: verified before anything in the directory is opened."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Exit codes and result files that every command line shares (design §9)."""
+"""Exit codes and result files that every command line shares."""
 
 from __future__ import annotations
 

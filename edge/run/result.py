@@ -1,4 +1,4 @@
-"""The begin and the result of a run as JSON values (design §9: other tools rely on these keys)."""
+"""The begin and the result of a run as JSON values; other tools rely on these keys."""
 
 from __future__ import annotations
 

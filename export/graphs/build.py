@@ -1,4 +1,4 @@
-"""Writes the graphs of an artifact directory by name (design §5)."""
+"""Writes the graphs of an artifact directory by name."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ def _require_sizes(config: object) -> None:
 
 @dataclass(frozen=True)
 class VisionConfig:
-    """InternViT-style encoder and its projector (design §3; defaults are InternViT-300M)."""
+    """InternViT-style encoder and its projector (defaults are InternViT-300M)."""
 
     image_px: int = 448
     patch_px: int = 14
@@ -90,7 +90,7 @@ class VisionConfig:
 
 @dataclass(frozen=True)
 class LanguageConfig:
-    """Qwen2.5-style decoder (design §3; defaults are Qwen2.5-0.5B as in InternVL3-1B)."""
+    """Qwen2.5-style decoder (defaults are Qwen2.5-0.5B as in InternVL3-1B)."""
 
     hidden: int = 896
     layers: int = 24

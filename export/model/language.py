@@ -1,4 +1,4 @@
-"""Language model: Qwen2.5-style decoder whose last-layer keys and values are the semantic state (design §3)."""
+"""Language model: Qwen2.5-style decoder whose last-layer keys and values are the semantic state."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Vision encoder: InternViT blocks, pixel shuffle v2 and the projector into visual tokens (design §3)."""
+"""Vision encoder: InternViT blocks, pixel shuffle v2 and the projector into visual tokens."""
 
 from __future__ import annotations
 
