@@ -3,7 +3,7 @@
 | record | messages |
 |---|---|
 | `/camera` (itself a CompressedImage) | `/camera/calibration` with the first picture of every size |
-| `/tick` | `/tf` odom → base → camera, `/plan`, `/velocity`, the odometry's uncertainty in `/scene` |
+| `/tick` | `/tf` odom → base → camera, `/plan`, `/velocity`; driven path and odometry's uncertainty in `/scene` |
 | `/semantic` | anchor and waypoints in `/scene`, the reasoning text in `/log` |
 | `/fault`, `/run`, `/result` | `/log` |
 
@@ -33,6 +33,11 @@ _PLAN_COLOUR, _ANCHOR_COLOUR, _WAYPOINT_COLOUR = (0.12, 0.44, 0.55), (0.54, 0.37
 _ODOMETRY_COLOUR: Final = (0.82, 0.38, 0.24)
 _SHOWN_SDS: Final = 2.0
 """Half-axes of the uncertainty's ellipse, standard deviations."""
+_PATH_COLOUR: Final = (0.25, 0.25, 0.25)
+_PATH_STEP_M: Final = 0.5
+_PATH_STEPS: Final = 10  # of one entity: few enough to be written again at every step
+_PATH_ENTITIES: Final = 32
+"""Pieces of the driven path that are shown, 5 m each; the newest replaces the oldest."""
 _UPRIGHT: Final = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
 _MALFORMED: Final = (LookupError, TypeError, ValueError, AttributeError, OverflowError, struct.error)
 
@@ -54,6 +59,7 @@ class StandardMessages:
     def __init__(self) -> None:
         self._mount: Mount | None = None
         self._size: tuple[int, int] | None = None
+        self._path = DrivenPath()
         self._of: Mapping[str, Callable[[int, Any], list[StandardMessage]]] = {
             "/run": self._run,
             "/camera": self._camera,
@@ -95,11 +101,35 @@ class StandardMessages:
         if all(_is_finite(step.as_tuple()) for step in steps):
             poses = [pose @ step for step in (SE2(0.0, 0.0, 0.0), *steps)] if steps else []
             messages.append(StandardMessage("/plan", stamp_ns, poses_in_frame(now_ns, poses)))
+        if (piece := self._path.put(now_ns, pose)) is not None:
+            messages.append(StandardMessage("/scene", stamp_ns, scene(piece)))
         sds, offset = record.get("offset_sd"), _pose_or_none(record["offset"])
         if sds is not None and offset is not None and _is_finite(sds):
             entity = uncertainty_entity(now_ns, pose, pose.theta_rad - offset.theta_rad, sds)
             messages.append(StandardMessage("/scene", stamp_ns, scene(entity)))
         return messages
+
+
+class DrivenPath:
+    """Path of the robot on the floor as entities of a scene, each a piece of the line."""
+
+    def __init__(self) -> None:
+        self._points: list[SE2] = []
+        self._piece = 0
+
+    def put(self, stamp_ns: int, T_odom_base: SE2) -> Json | None:
+        """Return the path's newest piece where the robot is a step further; else None."""
+        x_m, y_m, _ = T_odom_base.as_tuple()
+        if self._points and math.hypot(self._points[-1].x_m - x_m, self._points[-1].y_m - y_m) < _PATH_STEP_M:
+            return None
+        self._points.append(T_odom_base)
+        if len(self._points) < 2:
+            return None
+        line = _line(self._points, _PATH_COLOUR)
+        entity = _entity(stamp_ns, f"driven path {self._piece}", lines=[line])
+        if len(self._points) > _PATH_STEPS:
+            self._points, self._piece = self._points[-1:], (self._piece + 1) % _PATH_ENTITIES
+        return entity
 
 
 class Mount(NamedTuple):
@@ -218,11 +248,7 @@ def semantic_entity(stamp_ns: int, anchor: SE2, waypoints: Sequence[SE2], label:
         {"pose": _pose(place), "size": _vector(0.15, 0.15, 0.15), "color": _colour(_WAYPOINT_COLOUR)}
         for place in waypoints
     ]
-    line = {
-        "type": 0, "pose": _pose(SE2(0.0, 0.0, 0.0)), "thickness": 0.03, "scale_invariant": False,
-        "points": [_vector(place.x_m, place.y_m, 0.0) for place in (anchor, *waypoints)],
-        "color": _colour(_WAYPOINT_COLOUR), "colors": [], "indices": [],
-    }  # fmt: skip
+    line = _line((anchor, *waypoints), _WAYPOINT_COLOUR)
     text = {
         "pose": _pose(waypoints[-1] if waypoints else anchor, 0.4), "billboard": True, "font_size": 0.15,
         "scale_invariant": False, "color": _colour(_WAYPOINT_COLOUR), "text": label[:120],
@@ -269,6 +295,14 @@ def _entity(stamp_ns: int, name: str, **parts: list[Json]) -> Json:
     return {
         "timestamp": stamp(stamp_ns), "frame_id": ODOM, "id": name, "lifetime": stamp(0), "frame_locked": False,
         "metadata": [], **{kind: parts.get(kind, []) for kind in kinds},
+    }  # fmt: skip
+
+
+def _line(places: Sequence[SE2], colour: tuple[float, float, float]) -> Json:
+    return {
+        "type": 0, "pose": _pose(SE2(0.0, 0.0, 0.0)), "thickness": 0.03, "scale_invariant": False,
+        "points": [_vector(place.x_m, place.y_m, 0.0) for place in places],
+        "color": _colour(colour), "colors": [], "indices": [],
     }  # fmt: skip
 
 

@@ -38,7 +38,8 @@ from edge.live.metrics import CONTENT_TYPE, Metrics
 from edge.live.stop import RobotStop
 from edge.live.view import LiveState, Message
 
-FOXGLOVE_ORIGINS: Final = ("https://app.foxglove.dev",)
+FOXGLOVE_ORIGINS: Final = ("https://app.foxglove.dev", "file://")
+"""Origins of Foxglove in a browser and as a program, whose page is a file; the token is needed too."""
 MOST_CLIENTS: Final = 16
 END_S: Final = 6
 """Time by which this process outlives its runner at most, s: 4 s for stops, 1.5 s for what clients have not read."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from datetime import datetime, timezone
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from edge.flightlog.part import encode
 from edge.flightlog.reader import read_messages
 from edge.flightlog.recorder import Recorder, RecorderLimits
 from edge.flightlog.replay.records import RecordedFrame, RecordedGeneration, RecordedTick, read_events, read_run
-from edge.flightlog.standard_messages import Mount, StandardMessages, jpeg_size
+from edge.flightlog.standard_messages import DrivenPath, Mount, StandardMessages, jpeg_size
 from edge.flightlog.standard_schemas import COMPRESSED_IMAGE, STANDARD_SCHEMAS
 from edge.odometry.camera_geometry import Attitude, CameraGeometry, FloorProjector
 from tests.edge.flightlog.test_log_schemas import SAMPLES, complaints
@@ -125,6 +126,30 @@ def test_waypoints_are_drawn_from_the_anchor_not_from_the_robot() -> None:
     entity = by_topic([("/semantic", {**SEMANTIC, "anchor_pose": [5.0, 1.0, math.pi / 2]})])["/scene"][0]["entities"][0]
     places = [(sphere["pose"]["position"]["x"], sphere["pose"]["position"]["y"]) for sphere in entity["spheres"]]
     assert places == [pytest.approx((5.0, 2.0)), pytest.approx((4.5, 3.0))]
+
+
+def test_the_driven_path_is_a_line_of_pieces_that_join() -> None:
+    path = DrivenPath()
+    pieces: dict[str, list[float]] = {}
+    for tick in range(400):  # 20 m at 0.5 m/s
+        entity = path.put(tick, SE2(0.05 * tick, 0.0, 0.0))
+        if entity is not None:
+            pieces[entity["id"]] = [point["x"] for point in entity["lines"][0]["points"]]
+    lines = list(pieces.values())
+    assert len(lines) == 4 and all(len(line) == 11 for line in lines[:-1])
+    assert all(before[-1] == after[0] for before, after in pairwise(lines))
+    assert lines[0][0] == 0.0 and lines[-1][-1] == pytest.approx(19.95, abs=0.5)
+
+
+def test_a_robot_that_stands_adds_nothing_to_its_path() -> None:
+    path = DrivenPath()
+    assert [path.put(tick, SE2(1.0, 2.0, 0.1 * tick)) for tick in range(50)] == [None] * 50
+
+
+def test_the_newest_piece_of_a_long_path_replaces_the_oldest() -> None:
+    path = DrivenPath()
+    entities = [path.put(step, SE2(0.6 * step, 0.0, 0.0)) for step in range(1000)]
+    assert len({entity["id"] for entity in entities if entity is not None}) == 32
 
 
 @pytest.mark.parametrize(

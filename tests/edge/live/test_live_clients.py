@@ -8,6 +8,8 @@ import socket
 from collections.abc import Awaitable, Callable
 from typing import Any
 
+import pytest
+from aiohttp import WSServerHandshakeError
 from aiohttp.test_utils import TestClient, TestServer
 
 from edge.live import wire
@@ -77,3 +79,32 @@ def test_the_metrics_count_what_the_runner_dropped_and_what_cannot_be_read() -> 
         return await (await client.get("/metrics?token=t")).text()
 
     assert "tic_vla_view_dropped_records 9.0" in serve(datagrams, read).splitlines()
+
+
+@pytest.mark.parametrize(
+    ("path", "origin", "served"),
+    [
+        ("/foxglove", "https://app.foxglove.dev", True),
+        ("/foxglove", "file://", True),
+        ("/foxglove", "https://elsewhere.example", False),
+        ("/view", "file://", False),
+        ("/view", "https://app.foxglove.dev", False),
+    ],
+)
+def test_only_foxglove_is_served_pages_of_another_origin(path: str, origin: str, served: bool) -> None:
+    async def status(client: Client) -> int:
+        try:
+            async with client.ws_connect(f"{path}?token=t", protocols=("foxglove.sdk.v1",), headers={"Origin": origin}):
+                return 101
+        except WSServerHandshakeError as error:
+            return error.status
+
+    assert serve([], status) == (101 if served else 403)
+
+
+def test_foxglove_without_the_token_is_refused_from_its_own_origin() -> None:
+    async def status(client: Client) -> int:
+        response = await client.get("/foxglove", headers={"Origin": "file://"})
+        return int(response.status)
+
+    assert serve([], status) == 403
