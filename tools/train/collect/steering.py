@@ -165,7 +165,7 @@ _LATEST: Final = 0.8  # a detour begins within this share of the route's length
 _LEAST_M: Final = 1.0  # shortest detour
 _NEAR_M: Final = 1.0  # distance to the other place at which the robot turns back
 _MISTAKEN: Final = 0.6  # share of detours into a wrong opening, if the route has one
-_INTO_M: Final = 2.0  # depth that the robot enters a wrong opening
+_INTO_M: Final = 2.0  # least depth that the robot enters a wrong opening
 _BEFORE_M: Final = 1.5  # distance before the opening, or before the route's turn, at which the detour begins
 _GRAIN_M: Final = 0.1  # spacing of the points at which a route is sampled
 _NEARBY_M: Final = 8.0  # distance to the correct opening within which another one is mistaken for it
@@ -182,13 +182,15 @@ class Detour:
     for_m: float
 
 
-def draw_detour(site: Site, robot: str, task: Task, most_m: float, rng: np.random.Generator) -> Detour | None:
+def draw_detour(
+    site: Site, robot: str, task: Task, most_m: float, rng: np.random.Generator, *, into_m: float = _INTO_M
+) -> Detour | None:
     """Draw a detour from a task's route: into a wrong opening, as after miscounting, or up to `most_m` to any place.
 
-    Returns None if no place was found.
+    `into_m`: greatest depth in a wrong opening. Returns None if no place was found.
     """
     mistaken, where, far = (float(value) for value in rng.uniform(size=3))
-    if mistaken < _MISTAKEN and (found := wrong_opening(site, robot, task, rng)) is not None:
+    if mistaken < _MISTAKEN and (found := wrong_opening(site, robot, task, rng, into_m=into_m)) is not None:
         return found
     try:
         x, y, _ = draw_start(site.scene, site.robot_grid(robot), rng)
@@ -197,12 +199,15 @@ def draw_detour(site: Site, robot: str, task: Task, most_m: float, rng: np.rando
     return Detour((x, y), where * _LATEST * task.route.length_m, _LEAST_M + far * (most_m - _LEAST_M))
 
 
-def wrong_opening(site: Site, robot: str, task: Task, rng: np.random.Generator) -> Detour | None:
-    """Draw a detour into an opening near the correct one; None if there is none."""
+def wrong_opening(
+    site: Site, robot: str, task: Task, rng: np.random.Generator, *, into_m: float = _INTO_M
+) -> Detour | None:
+    """Draw a detour into an opening near the correct one, up to `into_m` deep; None if there is none."""
     choices = [(step, opening) for step in task.route.steps for opening in _others(site, step)]
     if not choices:
         return None
     step, opening = choices[int(rng.integers(len(choices)))]
+    goal_m = (float(rng.uniform(_INTO_M, into_m)) if into_m > _INTO_M else _INTO_M) + _NEAR_M
     frame, sign = Frame(step.ahead), 1.0 if opening.side == "left" else -1.0
     middle_m, across_m = opening.middle_m, frame.across(step.at)
     mouth = frame.point(middle_m, across_m)
@@ -210,7 +215,7 @@ def wrong_opening(site: Site, robot: str, task: Task, rng: np.random.Generator) 
     # A crossed passage already begins on the other side of the route.
     edge_m = max(low_m, across_m) if sign > 0 else min(high_m, across_m)
     depth_m = high_m - edge_m if sign > 0 else edge_m - low_m
-    inside = frame.point(middle_m, edge_m + sign * min(_INTO_M + _NEAR_M, 0.7 * depth_m))
+    inside = frame.point(middle_m, edge_m + sign * min(goal_m, 0.7 * depth_m))
     to = site.robot_grid(robot).nearest_free(*inside)
     if to is None or not opening.area.contains(*to):
         return None

@@ -249,7 +249,9 @@ class _Tour:
         if float(self._rng.uniform()) >= self._config.stray_share:
             return None
         for _ in range(_DECOYS):
-            detour = draw_detour(self._site, self._robot, self._task, self._config.stray_m, self._rng)
+            detour = draw_detour(
+                self._site, self._robot, self._task, self._config.stray_m, self._rng, into_m=self._config.stray_into_m
+            )
             planner = None if detour is None else self._planner_to(detour.to, 0.5)
             if detour is not None and planner is not None and planner.reachable(*self._here):
                 self._left_s += 2 * detour.for_m / _ALLOWED_MPS

@@ -148,7 +148,9 @@ def _drive(order: Order, number: int, scenario: Scenario) -> Entry:
     detour = None
     if draw.strays and order.policy is None:
         way_rng = np.random.default_rng((order.seed, number, _TAG, 3))
-        detour = draw_detour(scenario.site, episode.robot, scenario.task, config.stray_m, way_rng)
+        detour = draw_detour(
+            scenario.site, episode.robot, scenario.task, config.stray_m, way_rng, into_m=config.stray_into_m
+        )
     plan = DrivePlan(
         episode=episode,
         scene=scenario.scene,

@@ -64,6 +64,8 @@ class CollectConfig(Checked):
     stray_m: Annotated[float, Range(1, 50)] = 6.0
     """Share of the expert's drives that leave the route and come back, and the longest detour, m. Most detours lead
     into an opening near the correct one, the others to any other place."""
+    stray_into_m: Annotated[float, Range(2, 20)] = 2.0
+    """Greatest depth that the robot enters a wrong opening, m; drawn from 2 m on for each detour."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -90,6 +92,8 @@ class TourConfig(Checked):
     """Tours that leave the route and come back; most lead into an opening near the correct one."""
     stray_m: Annotated[float, Range(1, 50)] = 8.0
     """Longest detour to another place, m."""
+    stray_into_m: Annotated[float, Range(2, 20)] = 2.0
+    """Greatest depth that the robot enters a wrong opening, m; drawn from 2 m on for each detour."""
     linger_s: Annotated[float, Range(0, 60)] = 5.0
     """Longest recording after arrival, s; each tour takes between half of it and all of it."""
 

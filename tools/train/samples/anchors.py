@@ -129,7 +129,6 @@ def anchors_of(drive: Drive, every: int = TRACE_EVERY) -> list[Anchor]:
         near = [i if 0 <= i < len(drive) else None for i in range(k - AROUND, k + AROUND + 1)]
         T_odom_base = drive.T_odom_base(k)
         points, reasoning = _points(drive, k), aspects_of_json(trace)
-        turns_back = reasoning.plan is not None and isinstance(reasoning.plan.action, TurnBack)
         found.append(
             Anchor(
                 drive_id=drive.id,
@@ -143,7 +142,7 @@ def anchors_of(drive: Drive, every: int = TRACE_EVERY) -> list[Anchor]:
                 earlier=tuple(earlier),
                 around=tuple(None if i is None else _points(drive, i) for i in near),
                 moved=tuple(None if i is None else _from(drive.T_odom_base(i), T_odom_base) for i in near),
-                decides=turns_back or labels[max(0, number - _NEAR)] != labels[min(number + _NEAR, last)],
+                decides=turns_back(reasoning) or labels[max(0, number - _NEAR)] != labels[min(number + _NEAR, last)],
             )
         )
     return found
@@ -176,7 +175,10 @@ def draw(anchor: Anchor, config: DrawConfig, rng: np.random.Generator) -> Drawn:
         lowest, highest = highest, config.before_latest_s
     ago_s = lowest + ago * (highest - lowest)
     before = anchor.before(ago_s)
-    if wrong < config.before_wrong and before is not None:
+    missed = too_far(before) if before is not None and turns_back(anchor.reasoning) else []
+    if missed and wrong < config.before_ahead_off_route:
+        before = missed[0]
+    elif wrong < config.before_wrong and before is not None:
         # Drives do not contain progress that is ahead of the truth, so it is added here.
         others: Sequence[Progress | None] = too_far(before) if ahead < _AHEAD_SHARE else ()
         stale = anchor.before(ago_s + old * _STALE_S)
@@ -202,6 +204,11 @@ def _noisy_way(way: PastPath, config: DrawConfig, noise: npt.NDArray[np.float64]
 
 def _tenth(value_m: float) -> float:
     return min(max(round(value_m, 1), -FARTHEST_M), FARTHEST_M) + 0.0
+
+
+def turns_back(text: ReasoningText) -> bool:
+    """Return whether the plan is to turn back: the robot has left its route."""
+    return text.plan is not None and isinstance(text.plan.action, TurnBack)
 
 
 def too_far(progress: Progress) -> list[Progress]:

@@ -14,11 +14,11 @@ from typing import Any, Final
 import numpy as np
 
 from edge.reasoning.decoding_rules import DecodingContext, TextConstraint
-from edge.state.reasoning_text import AHEAD, WAYPOINT_TIMES_S, ReasoningText, Turn, TurnBack, parse_text
+from edge.state.reasoning_text import AHEAD, WAYPOINT_TIMES_S, ReasoningText, Turn, parse_text
 from export.model.language import LanguageModel
 from tools.train.config.collect import RATE_HZ
 from tools.train.config.sft import EvalConfig
-from tools.train.samples.anchors import WAYPOINTS_START, Anchor, Drawn, Prompts
+from tools.train.samples.anchors import WAYPOINTS_START, Anchor, Drawn, Prompts, turns_back
 from tools.train.samples.language_batch import FrameTokens, Row, collate, decode, frames_of
 
 _TAG: Final = 0xE7A1
@@ -52,7 +52,7 @@ class Score:
         elif anchor.before(self._gap_s) is not None:
             found["repeats"] += 1
             found["false change"] += progress != anchor.progress
-        said_back, true_back = (_turns_back(text) for text in (answer, anchor.reasoning))
+        said_back, true_back = (turns_back(text) for text in (answer, anchor.reasoning))
         found["backs"] += true_back
         found["backs said"] += said_back
         found["backs right"] += said_back and true_back
@@ -206,11 +206,6 @@ def side_of(text: ReasoningText) -> str | None:
     """Return the side of the planned turn, "left" or "right"; None for another plan."""
     action = None if text.plan is None else text.plan.action
     return action.side if isinstance(action, Turn) and action.side != AHEAD else None
-
-
-def _turns_back(text: ReasoningText) -> bool:
-    """Return whether the plan is to turn back: the robot has left its route."""
-    return text.plan is not None and isinstance(text.plan.action, TurnBack)
 
 
 def landmarks_of(text: ReasoningText) -> Counter[str]:

@@ -88,11 +88,13 @@ def detours(scenario: Scenario, count: int = DRAWS) -> list[Detour | None]:
     ]
 
 
+def mistake(scenario: Scenario, seed: int, into_m: float = 2.0) -> Detour | None:
+    rng = np.random.default_rng((seed, 7))
+    return wrong_opening(scenario.site, scenario.episode.robot, scenario.task, rng, into_m=into_m)
+
+
 def mistakes(scenario: Scenario, count: int = DRAWS) -> list[Detour]:
-    drawn = (
-        wrong_opening(scenario.site, scenario.episode.robot, scenario.task, np.random.default_rng((seed, 7)))
-        for seed in range(count)
-    )
+    drawn = (mistake(scenario, seed) for seed in range(count))
     return [detour for detour in drawn if detour is not None]
 
 
@@ -137,6 +139,16 @@ def test_a_wrong_opening_leads_into_an_area_near_a_step_that_is_not_the_one_to_b
                 assert near or len(scenario.route.steps) > 1
             assert any(beside) and any(area.contains(*detour.to) for area in scenario.scene.areas)
     assert found
+
+
+@pytest.mark.slow
+def test_a_wrong_opening_can_be_entered_deeper() -> None:
+    def lengths_m(into_m: float) -> list[float]:
+        drawn = (mistake(scenario, seed, into_m) for scenario in all_scenarios() for seed in range(DRAWS))
+        return [detour.for_m for detour in drawn if detour is not None]
+
+    further_m = np.subtract(lengths_m(10.0), lengths_m(2.0))
+    assert max(further_m) > 2.0 and min(further_m) >= 0
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from edge.inference.language import Generation
 from edge.reasoning.decoding_rules import DecodingContext, TextConstraint
 from edge.reasoning.generation_cycle import ReasoningConfig
 from edge.reasoning.prompt import PromptBuilder, PromptIds, Segment
-from edge.state.reasoning_text import Progress, format_text, parse_progress, parse_waypoints
+from edge.state.reasoning_text import Plan, Progress, Stop, TurnBack, format_text, parse_progress, parse_waypoints
 from edge.state.ring import EncodedFrame, TokenRing
 from edge.state.semantic import SemanticSlot, SharedState
 from export.model.config import PRESETS
@@ -169,6 +169,33 @@ def test_wrong_progress_has_the_given_share_and_is_always_wrong(anchors: dict[in
     assert np.mean([each in too_far(right) for each in wrong]) > 0.5
     assert np.mean([each.waypoints_only for each in drawn]) == pytest.approx(0.3, abs=0.04)
     assert {each.wording for each in drawn} == set(WORDINGS)
+
+
+@pytest.mark.parametrize("action", [TurnBack(), Stop(3)])
+def test_off_the_route_the_missed_turn_counts_as_done_in_the_given_share(
+    action: TurnBack | Stop, anchors: dict[int, Anchor]
+) -> None:
+    config = DrawConfig(
+        before_min_s=1.0, before_max_s=1.0, before_late=0.0, before_wrong=0.0, before_ahead_off_route=0.4
+    )
+    anchor = dataclasses.replace(anchors[60], reasoning=dataclasses.replace(anchors[60].reasoning, plan=Plan(action)))
+    right, rng = anchor.before(1.0), np.random.default_rng(0)
+    drawn = [draw(anchor, config, rng).before for _ in range(1000)]
+    assert right is not None and set(drawn) <= {right, Progress(right.step + 1, right.steps, 0)}
+    share = np.mean([before != right for before in drawn])
+    assert share == (pytest.approx(0.4, abs=0.05) if isinstance(action, TurnBack) else 0)
+
+
+def test_on_the_last_leg_no_turn_can_be_missed(anchors: dict[int, Anchor]) -> None:
+    config = DrawConfig(before_wrong=0.0, before_ahead_off_route=1.0)
+    last = Progress(2, 1, 0)
+    anchor = dataclasses.replace(
+        anchors[60],
+        reasoning=dataclasses.replace(anchors[60].reasoning, plan=Plan(TurnBack())),
+        earlier=(last,) * 7,
+        progress=last,
+    )
+    assert draw(anchor, config, np.random.default_rng(0)).before in (last, None)
 
 
 def test_past_motion_matches_that_of_another_odometry_origin(anchors: dict[int, Anchor]) -> None:
