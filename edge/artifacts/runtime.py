@@ -79,7 +79,7 @@ class RuntimeConfig:
     """Processor cores of the control thread; empty: the runner chooses among the available ones."""
     reasoning_cores: tuple[int, ...]
     control_priority: int
-    """Real-time priority of the control thread, above 0 and below the bridge's; 0: none."""
+    """Highest real-time priority of the runner's threads, below the bridge's; control has 1 less. 0: none."""
     decoding: Decoding = Decoding.CONSTRAINED
     recovery: RecoverySwitch = RecoverySwitch.ON
     speculation: Speculation = Speculation.ON

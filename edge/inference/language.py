@@ -204,7 +204,6 @@ class LanguageModel:
         full = exact_calls_ns(call, self._kv, end, first[:MOST_ROWS])
         call_ns = {rows: min(took_ns, full[rows]) for rows, took_ns in usual.items() if rows in full}
         if LEAST_ROWS not in call_ns:
-            self.rows = (1,)
             return (
                 "speculation is off: on this device a token's keys and values depend on the other tokens of its call, "
                 "so guesses could change the text"

@@ -20,6 +20,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from edge.artifacts.runtime import RANGES
 from edge.state.switches import Speculation
 from export.model.config import TicVlaConfig
 from export.plan.guessing import GuessingTime, guessing_time
@@ -342,10 +343,10 @@ def _reasons(target: Target, made: Plan, share: _Share) -> list[str]:
     if made.tick.ms > period:
         heaviest = max((s for s in made.stages if s.stage in made.work.tick_stages), key=lambda s: s.whole.ms)
         rounded = -(-round(made.tick.ms) // 10) * 10
+        slower = f" or set runtime.tick_period_ms={rounded}" if rounded <= RANGES["tick_period_ms"][1] else ""
         reasons.append(
             f"tick {made.tick.ms:.0f} ms exceeds the period of {period} ms by {made.tick.ms - period:.0f} ms, "
-            f"{heaviest.graph} takes {heaviest.whole.ms:.0f}: give it a faster precision or set "
-            f"runtime.tick_period_ms={rounded}"
+            f"{heaviest.graph} takes {heaviest.whole.ms:.0f}: give it a faster precision{slower}"
         )
     if made.budget_w is not None and made.average_w is not None and made.average_w > made.budget_w * 1.0001:
         reasons.append(

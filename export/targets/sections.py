@@ -319,7 +319,7 @@ class RuntimePolicy:
     """Processor cores of the control thread; empty: the runner chooses."""
     reasoning_cores: tuple[int, ...] = ()
     control_priority: int = 50
-    """Real-time priority of the control thread, 1 to 59, below the bridge's; 0: none."""
+    """Highest real-time priority of the runner's threads, 1 to 59, below the bridge's; control has 1 less. 0: none."""
     decoding: str = Decoding.CONSTRAINED.value
     recovery: str = RecoverySwitch.ON.value
     speculation: str = Speculation.ON.value

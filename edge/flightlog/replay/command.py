@@ -30,8 +30,7 @@ from edge.flightlog.reader import RecordingError, parts
 from edge.flightlog.replay.policy import Comparison, Replayer
 from edge.flightlog.replay.records import RecordedRun, RecordedTick, read_events, read_run
 from edge.inference import engines
-from edge.inference.language import LanguageModel
-from edge.inference.policy import Policy
+from edge.inference.warm_up import open_proven
 from firmware_bridge.system.terminal import CommandParser
 
 EXAMPLES = """examples:
@@ -101,12 +100,14 @@ _print = messages("edge-replay")
 
 def replay(path: Path, artifacts: Artifacts, run: RecordedRun, from_s: float, to_s: float) -> tuple[Comparison, int]:
     """Replay a log; return the comparison and the log's tick count. Raises RecordingError, ArtifactError, OSError."""
-    policy, language = Policy(artifacts), LanguageModel(artifacts)
+    opened = open_proven(artifacts)
     first_ns = next((event.now_ns for event in read_events(path) if isinstance(event, RecordedTick)), None)
     if first_ns is None:
         raise RecordingError(f"{path}: holds no /tick record, the run ended before its first control tick")
     to_ns = first_ns + round(to_s * 1e9) if math.isfinite(to_s) else 2**63
-    replayer = Replayer(artifacts, policy, language, run, from_ns=first_ns + round(from_s * 1e9), to_ns=to_ns)
+    replayer = Replayer(
+        artifacts, opened.policy, opened.language, run, from_ns=first_ns + round(from_s * 1e9), to_ns=to_ns
+    )
     ticks, printed_ns = 0, time.monotonic_ns()
     for event in read_events(path):
         replayer.step(event)

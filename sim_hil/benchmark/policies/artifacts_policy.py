@@ -74,10 +74,11 @@ class ArtifactsPolicy:
         self.language = LanguageModel(self._artifacts, threads=1)
         note = self.language.speculate() if self._switches.speculation is Speculation.ON else None
         rows = max((rows for rows, _ in latency.call_s), default=0)
-        if self._switches.speculation is Speculation.ON and rows > max(self.language.rows[-1], 1):
+        most = 1 if self.language.speculator is None else self.language.rows[-1]
+        if self._switches.speculation is Speculation.ON and rows > most:
             raise ArtifactError(
                 f"{directory}: latency profile {latency.name} has calls of up to {rows} rows, this machine computes at "
-                f"most {self.language.rows[-1]} with equal bits ({note}); choose --speculation off"
+                f"most {most} with equal bits ({note}); choose --speculation off"
             )
         self._drive: _Drive | None = None
         self.recorder: RecordSink | None = None

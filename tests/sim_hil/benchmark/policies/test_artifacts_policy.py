@@ -192,7 +192,6 @@ def test_more_rows_than_this_machine_computes_exactly_are_refused(
     artifacts_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(model: LanguageModel) -> str:
-        model.rows = (1,)
         return "no equal bits"
 
     monkeypatch.setattr(LanguageModel, "speculate", refuse)
