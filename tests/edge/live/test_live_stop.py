@@ -23,7 +23,7 @@ Operate = Callable[..., tuple[int, dict[str, object]]]
 
 
 class Desk:
-    """A STOP button, the operator's stop behind it, and a runner that answers what it is told to, or nothing."""
+    """A STOP button, the operator's stop behind it, and a runner with a set answer to, or nothing."""
 
     def __init__(self, patch: pytest.MonkeyPatch) -> None:
         self.confirms: bool | None = None

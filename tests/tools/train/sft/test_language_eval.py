@@ -69,7 +69,7 @@ def test_turning_back_is_scored_where_it_is_true_and_where_it_is_said(anchors: l
 
 
 class Parrot:
-    """Says one text at every anchor, and remembers what it was told."""
+    """Answers every anchor with one text, and keeps its prompts."""
 
     def __init__(self, texts: Sequence[str]) -> None:
         self.texts = list(texts)
