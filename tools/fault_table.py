@@ -13,8 +13,9 @@ HEAD = """# What can go wrong
 
 Made from `edge/safety/faults/table.py` by `python -m tools.fault_table`; do not edit.
 *Row* is the number that code, tests and the soak's budget name as the fault matrix's row.
-*Bound* runs from the fault's effect at our input to the velocity on the wire. The bound of `camera-frozen` holds for pictures that are equal byte for byte. A scene that stays the same under noise, a clock or a new JPEG
-encoding is found by distance, after about 0.25 m or 12° of motion. The actions:
+*Bound* runs from the fault's effect at our input to the velocity on the wire. The bound of `camera-frozen` holds for
+pictures that are equal byte for byte; a scene that stays the same under noise, a clock or a new JPEG encoding is found
+by distance, after about 0.25 m or 12° of motion. The actions:
 
 * **nothing**: control must not change; the fault is dropped or counted.
 * **limit**: the speed limit is lowered to the share that is given, the arc is kept; `semantic-old` lowers it with age;
