@@ -6,8 +6,8 @@ import fcntl
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,15 +15,18 @@ from typing import Any
 from edge.artifacts.files import MANIFEST_NAME, SCHEMA_VERSION, ArtifactError, read_manifest, seal
 from edge.artifacts.manifest import load_artifacts
 from edge.artifacts.runtime import SPECIAL_TOKENS
+from edge.inference.start_guard import Memory, StartGuard
 from export.core.cache import StageCache, file_sha256, fsync_path, package_versions
 from export.evaluation.gates import WARN, GateResult, require
+from export.evaluation.task_samples import is_large
 from export.graphs.build import graph_contract, graph_parameters
 from export.model.config import TicVlaConfig
-from export.pipeline.build import Pipeline
+from export.pipeline.build import EXPECTED_S, Pipeline
 from export.pipeline.job import Job
 from export.pipeline.report import report_html
 from export.pipeline.self_test import (
     SELF_TEST_STAGE,
+    end_process,
     known_answers,
     recorded_and_expected_limits,
     repeat_self_test,
@@ -39,6 +42,10 @@ RUNNER_KEYS = ("control_cores", "reasoning_cores", "control_priority", "decoding
 TARGET_SECTIONS = ("name", "arch", "device", "power", "runtime", "gates")
 """Keys of `provenance.target` that the runner, `edge-doctor` or `verify` reads."""
 SHOWN_CHARACTERS = 60
+GATE_SLOWER, LEAST_GATE_S = 20.0, 60.0
+"""Time limit of a gate on files of unknown origin: a multiple of its expected duration, and time added to it, s."""
+UNLIMITED = Memory(own=lambda: 0, available=lambda: 0)
+"""PyTorch's model and its outputs share the gates' process: only their time is limited."""
 OLDER_SCHEMAS = (1, 2, 3)
 """Manifest schemas whose directories an export may replace."""
 
@@ -234,12 +241,19 @@ def _write_manifest(directory: Path, manifest: dict[str, Any]) -> None:
     _write_json(directory / MANIFEST_NAME, seal(manifest))
 
 
-def check_directory(pipeline: Pipeline, directory: Path, progress: BuildProgress) -> dict[str, GateResult]:
-    """Run the gates on the files on disk, through the runner's loader. Raises GateError at the first failure."""
+def check_directory(
+    pipeline: Pipeline, directory: Path, progress: BuildProgress,
+    watch: Callable[[str], AbstractContextManager[None]] = lambda graph: nullcontext(),
+) -> dict[str, GateResult]:  # fmt: skip
+    """Run the gates on the files on disk, through the runner's loader. Raises GateError at the first failure.
+
+    `watch`: context in which a graph's gate runs.
+    """
     artifacts = load_artifacts(directory)
     results: dict[str, GateResult] = {}
     for name in pipeline.job.target.graph_names:
-        result = results[name] = pipeline.gate(artifacts, name)
+        with watch(name):
+            result = results[name] = pipeline.gate(artifacts, name)
         require(name, result.verdict)
         if result.verdict.level == WARN:
             progress.log(f"{name}: near a limit: {'; '.join(result.verdict.reasons)}")
@@ -254,13 +268,17 @@ def verify_directory(job: Job, directory: Path, cache: StageCache, progress: Bui
     if weights.sha256 != manifest["provenance"].get("weights_sha256"):
         raise ArtifactError(f"{directory}: built from other weights than {weights.origin}; pass --checkpoint")
     _check_manifest(pipeline, directory, manifest)
-    # Before the gates: only the self-test ends a graph that loops or allocates without end.
+    artifacts = load_artifacts(directory)
+    # Before the gates: only the self-test ends a graph that allocates without end.
     with progress.stage(SELF_TEST_STAGE):
-        progress.log(f"self-test: {repeat_self_test(load_artifacts(directory))}")
+        progress.log(f"self-test: {repeat_self_test(artifacts)}")
     pipeline.task_reference()
     for name in job.target.graph_names:
         pipeline.reference(name)
-    results = check_directory(pipeline, directory, progress)
+    guard = StartGuard(artifacts, end=end_process, memory=UNLIMITED)
+    # A graph that passes the self-test may loop on other inputs.
+    limit_s = LEAST_GATE_S + GATE_SLOWER * EXPECTED_S["gate"][int(is_large(job.config))]
+    results = check_directory(pipeline, directory, progress, lambda graph: guard.stage(f"gate {graph}", limit_s))
     return {**manifest, "graphs": {n: {**g, "parity": results[n].to_dict()} for n, g in manifest["graphs"].items()}}
 
 

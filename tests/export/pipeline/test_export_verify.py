@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +18,7 @@ from edge.artifacts.files import seal
 from edge.artifacts.manifest import Artifacts
 from edge.core.cli import EXIT_CHECK_FAILED
 from edge.inference.self_test import SelfTestError
-from edge.inference.start_guard import StartGuard
+from edge.inference.start_guard import Memory, StartGuard
 from export.cli import main
 from export.core.cache import file_sha256
 from export.pipeline import job
@@ -64,6 +65,27 @@ def test_a_graph_that_loops_does_not_hang_verify(
     monkeypatch.setattr("export.pipeline.self_test.StartGuard", Impatient)
     assert main(["verify", str(copy)]) == 1
     assert "self-test: not done after its limit of 1.5 s" in capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.slow
+def test_a_graph_that_loops_in_its_gate_does_not_hang_verify(
+    artifacts_dir: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended = threading.Event()
+
+    class Short(StartGuard):
+        def __init__(self, artifacts: Artifacts, *, memory: Memory, **_: object) -> None:
+            super().__init__(artifacts, end=lambda _line: ended.set(), memory=memory)
+
+        @contextmanager
+        def stage(self, what: str, limit_s: float) -> Iterator[None]:
+            with super().stage(what, min(limit_s, 0.2)):
+                yield
+
+    monkeypatch.setattr("export.pipeline.artifacts.StartGuard", Short)
+    monkeypatch.setattr("export.pipeline.artifacts.Pipeline.gate", lambda *_: ended.wait(60))
+    assert main(["verify", str(artifacts_dir)]) == 1
+    assert "gate vision_encoder: not done after its limit of 0.2 s" in capsys.readouterr().err.splitlines()[-1]
 
 
 @pytest.mark.slow
