@@ -24,18 +24,20 @@ pytestmark = [pytest.mark.process, pytest.mark.slow]
 @pytest.fixture(scope="module", params=["unitree", "mavlink", "ros2"])
 def hil(request: pytest.FixtureRequest, dds_domain: int) -> Iterator[tuple[str, Path]]:
     """The address of a view, and the fault socket, of a robot of each kind of camera process."""
-    folder = Path(tempfile.mkdtemp(prefix="hil"))
     carter = ("--robot", "carter", "--scene", "corridor", "--protocol", request.param)
     arguments = {
         "unitree": hil_arguments(dds_domain),
         "mavlink": (*carter, "--link", "udp:127.0.0.1:14691,camera=0"),
         "ros2": (*carter, "--domain", dds_domain),
     }[request.param]
-    more = ("--people", 3, "--faults", folder / "faults", "--live", 0)
-    with running("sim_hil.hil.command", *arguments, *more, folder=folder) as process:
-        found = re.search(r"live view: (http\S+)", process.stderr())
-        assert found is not None, process.stderr()
-        yield found[1], folder / "faults"
+    # Short, because sockets lie in it.
+    with tempfile.TemporaryDirectory(prefix="hil") as name:
+        folder = Path(name)
+        more = ("--people", 3, "--faults", folder / "faults", "--live", 0)
+        with running("sim_hil.hil.command", *arguments, *more, folder=folder) as process:
+            found = re.search(r"live view: (http\S+)", process.stderr())
+            assert found is not None, process.stderr()
+            yield found[1], folder / "faults"
 
 
 async def _until(address: str, wanted: set[str]) -> dict[str, Any]:
