@@ -14,9 +14,10 @@ import numpy as np
 from sim_hil.crowd.looks import Appearance, appearances
 from sim_hil.crowd.plans import Plans
 from sim_hil.crowd.senses import ObservedRobot, RobotWatch, notice
+from sim_hil.crowd.spots import Destinations
 from sim_hil.crowd.state import Activity, Array, Crowd, Ints
 from sim_hil.crowd.steering import Nearby, choose
-from sim_hil.crowd.walkable_map import BODY_RADIUS_M, CrowdMap
+from sim_hil.crowd.walkable_map import BODY_RADIUS_M
 from sim_hil.scene.scene import Scene
 
 __all__ = [
@@ -59,7 +60,8 @@ class People:
     Nobody starts within 2.5 m of the scene's start. Raises ValueError if the scene has no room for `count` people.
     """
 
-    def __init__(self, scene: Scene, count: int, seed: int) -> None:
+    def __init__(self, scene: Scene, count: int, seed: int, destinations: Destinations | None = None) -> None:
+        """`destinations`: those of the scene, computed before; None: they are drawn with the seed."""
         if count < 0:
             raise ValueError(f"people: expected 0 or more, found {count}")
         rng = np.random.default_rng((seed, 7))
@@ -67,8 +69,9 @@ class People:
         self._steps = 0
         self._watch = RobotWatch(_ROBOT_AXIS_M)
         if count:
-            self._ways = CrowdMap(scene)
-            self._plans = Plans(scene, self._ways, self._crowd, rng)
+            known = Destinations.of(scene, count, rng) if destinations is None else destinations
+            self._ways = known.ways
+            self._plans = Plans(scene, known, self._crowd, rng)
             self._plans.settle(scene, _START_CLEAR_M)
             nothing = np.zeros(0, dtype=np.int64)
             self._pairs = [(nothing, nothing)] * _DECIDE_EVERY

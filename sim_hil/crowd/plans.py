@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from sim_hil.crowd.courtesy import Courtesy, Jams
 from sim_hil.crowd.groups import Groups
 from sim_hil.crowd.senses import ObservedRobot
-from sim_hil.crowd.spots import Start, route_spots, spots_of
+from sim_hil.crowd.spots import Destinations, Start
 from sim_hil.crowd.state import Activity, Crowd
-from sim_hil.crowd.walkable_map import CrowdMap
 from sim_hil.scene.scene import Scene, Vec2
 
 TALKING, PHONE = 1.0, 2.0
@@ -32,15 +31,10 @@ _PROGRESS_M = 0.4  # progress below which a person counts as stuck
 class Plans:
     """Decision making for all people; `update`, called at 10 Hz, sets preferred velocities and facing directions."""
 
-    def __init__(self, scene: Scene, ways: CrowdMap, crowd: Crowd, rng: np.random.Generator) -> None:
-        self._ways, self._crowd, self._rng = ways, crowd, rng
-        self._routes: list[list[int]] = []
-        if scene.routes and not scene.places:
-            self._spots, self._routes = route_spots(scene)
-        else:
-            self._spots = spots_of(scene, ways, crowd.n, rng)
-        ways.set_destinations([spot.reach for spot in self._spots])
-        self._spot_gaps = ways.gaps_at(*(np.array([spot.reach[axis] for spot in self._spots]) for axis in (0, 1)))
+    def __init__(self, scene: Scene, destinations: Destinations, crowd: Crowd, rng: np.random.Generator) -> None:
+        self._ways, self._crowd, self._rng = destinations.ways, crowd, rng
+        self._spots, self._routes = destinations.spots, destinations.routes
+        self._spot_gaps = self._ways.gaps_at(*(np.array([spot.reach[axis] for spot in self._spots]) for axis in (0, 1)))
         self._stop = np.array([_may_stop(scene, *spot.reach) for spot in self._spots])
         self._ends = np.array([spot.kind != "way" for spot in self._spots])
         self._queues: dict[int, list[int]] = {k: [] for k, s in enumerate(self._spots) if s.kind == "queue"}

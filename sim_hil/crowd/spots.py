@@ -36,6 +36,27 @@ class Spot:
     heading_rad: float
 
 
+@dataclass(frozen=True)
+class Destinations:
+    """A scene's map with the paths to all its spots, which takes most of the time to make a crowd."""
+
+    ways: CrowdMap
+    spots: tuple[Spot, ...]
+    routes: tuple[tuple[int, ...], ...]
+    """Routes of the scene as indices of spots; empty where people choose freely."""
+
+    @staticmethod
+    def of(scene: Scene, people: int, rng: np.random.Generator) -> Destinations:
+        """Compute them for a number of people. Raises ValueError if the scene has no walkable floor."""
+        ways = CrowdMap(scene)
+        if scene.routes and not scene.places:
+            spots, routes = route_spots(scene)
+        else:
+            spots, routes = spots_of(scene, ways, people, rng), []
+        ways.set_destinations([spot.reach for spot in spots])
+        return Destinations(ways, tuple(spots), tuple(map(tuple, routes)))
+
+
 def spots_of(scene: Scene, ways: CrowdMap, people: int, rng: np.random.Generator) -> list[Spot]:
     """Return the destinations for a number of people: a random subset of the places, and points on the floor."""
     most = int(np.clip(people + _PLACES_MIN, _PLACES_MIN, _PLACES_MAX))

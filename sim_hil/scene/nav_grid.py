@@ -129,8 +129,8 @@ class NavGrid:
             self.clearances = np.minimum(self.clearances, gaps)
 
     @cached_property
-    def _graph(self) -> tuple[NDArray[np.int32], NDArray[np.int64], csr_matrix]:
-        """Ids of the free cells [rows, columns], their rows and columns [n, 2], and the graph of steps [n, n]."""
+    def graph(self) -> tuple[NDArray[np.int32], NDArray[np.int64], csr_matrix]:
+        """Ids of the free cells [rows, columns], their rows and columns [n, 2], and the graph of steps [n, n], m."""
         ids, source, target, length = links(self.free, self.resolution_m)
         cells = np.argwhere(self.free)
         return ids, cells, csr_matrix((length, (source, target)), shape=(len(cells), len(cells)))
@@ -190,7 +190,7 @@ class NavGrid:
         if (row, column) not in self._trees:
             if len(self._trees) >= 32:
                 self._trees.pop(next(iter(self._trees)))
-            ids, _, steps = self._graph
+            ids, _, steps = self.graph
             self._trees[row, column] = dijkstra(
                 steps, directed=False, indices=int(ids[row, column]), return_predecessors=True
             )
@@ -229,7 +229,7 @@ class NavGrid:
         if first is None or last is None or tree is None:
             return None
         _, onwards = tree
-        ids, cells, _ = self._graph
+        ids, cells, _ = self.graph
         node = int(ids[self.free_cell(*first)])
         if not np.isfinite(tree[0][node]):
             return None

@@ -19,10 +19,11 @@ from edge.core.geometry import SE2
 from sim_hil.benchmark.env.observation import Observation
 from sim_hil.benchmark.env.world import EpisodeWorld
 from sim_hil.benchmark.policies.expert_motion import CONTROL_S, Choice, Driving, Motion
-from sim_hil.benchmark.policies.expert_route import SPACING_M, RoutePlanner
+from sim_hil.benchmark.policies.expert_route import SPACING_M, PlannerGround, RoutePlanner
 from sim_hil.benchmark.policies.policy import Velocity
 from sim_hil.benchmark.suite.episode import Episode
 from sim_hil.benchmark.suite.robots import max_step_m
+from sim_hil.scene.nav_grid import NavGrid
 
 Array = NDArray[np.float64]
 Vec2 = tuple[float, float]
@@ -83,14 +84,9 @@ class ExpertPolicy:
         """Plan the episode. Raises ValueError without a world or if the goal cannot be reached."""
         if world is None:
             raise ValueError("expert: expected the episode's world in reset(), found None")
-        planner = RoutePlanner(
-            world.scene,
-            episode.goal_xy,
-            world.robot.radius_m,
-            max_step_m(episode.robot),
-            NEAR * episode.threshold_m,
-            self._prescribed,
-        )
+        grid = NavGrid(world.scene, clearance_m=world.robot.radius_m, max_step_m=max_step_m(episode.robot))
+        ground = PlannerGround(world.scene, grid)
+        planner = RoutePlanner(ground, episode.goal_xy, NEAR * episode.threshold_m, self._prescribed)
         pose = world.pose()
         if not planner.reachable(pose.x_m, pose.y_m):
             raise ValueError(f"expert: episode {episode.id}: no path from the start to the goal for a {episode.robot}")

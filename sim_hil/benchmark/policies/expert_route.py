@@ -36,31 +36,17 @@ _DETOUR: Final = 1.01  # a straight segment may cost up to this factor more than
 _KEEP: Final = (1.2, 2.5)  # the previous route is kept while it costs at most 1.2 times the new one plus 2.5
 
 
-class RoutePlanner:
-    """Planner of routes to one goal.
+class PlannerGround:
+    """The part of a planner that does not depend on the goal; the planners of one scene and robot may share it.
 
-    `clearance_m`: least distance from the robot's centre to an obstacle. `near_m`: a route may end within this distance
-    of the goal if people occupy it. `prescribed`: points (m) of a preferred route. Raises ValueError if the scene has
-    no free space.
+    `grid`: the robot's navigation grid. `prices`: of a metre in each of its cells. `ids`: node of each coarse cell, -1
+    without one. `nodes`: the nodes' points [n, 2], m; `cells`: their rows and columns in the grid. `links`: lengths, m.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        goal_xy: Vec2,
-        clearance_m: float,
-        max_step_m: float,
-        near_m: float = 0.0,
-        prescribed: Sequence[Vec2] = (),
-    ) -> None:
-        self.grid = NavGrid(scene, clearance_m=clearance_m, max_step_m=max_step_m)
-        self._goal = goal_xy
-        self._price = self._static_price(scene) * self._stray_price(prescribed)
+    def __init__(self, scene: Scene, grid: NavGrid) -> None:
+        self.grid = grid
+        self.prices = self._static_price(scene)
         self._coarsen()
-        self._ends, self._end_prices = self._ends_near(near_m)
-        self._costs, self._onwards = self._search(np.zeros((0, 2)))
-        self._empty_costs = self._costs
-        self._searched = b""
 
     def _static_price(self, scene: Scene) -> Array:
         lack = np.clip(1.0 - (self.grid.clearances - self.grid.required_m) / ROOM_M, 0.0, 1.0)
@@ -74,16 +60,6 @@ class RoutePlanner:
                     cv2.fillPoly(street, [np.array(cells, np.int32)], value)
         return np.asarray(np.where(street > 0, price * _STREET_PRICE, price))
 
-    def _stray_price(self, prescribed: Sequence[Vec2]) -> Array:
-        """Return the price factor of each cell for leaving the prescribed route."""
-        off = np.ones(self.grid.shape, np.uint8)
-        if not prescribed:
-            return off.astype(np.float64)
-        cells = [self.grid.cell(x, y)[::-1] for x, y in prescribed]
-        cv2.polylines(off, [np.array(cells, np.int32)], isClosed=False, color=0)
-        gap_m = cv2.distanceTransform(off, cv2.DIST_L2, 5) * self.grid.resolution_m
-        return np.asarray(1.0 + _STRAY_PRICE * np.clip(gap_m / _WAY_M - 1.0, 0.0, 1.0), np.float64)
-
     def _coarsen(self) -> None:
         """Merge blocks of 2 x 2 cells: free if one of them is, represented by the one with most clearance."""
         grid = self.grid
@@ -95,20 +71,52 @@ class RoutePlanner:
         free = np.isfinite(quads.max(axis=2))
         row = 2 * np.arange(rows // 2)[:, None] + pick // 2
         column = 2 * np.arange(columns // 2)[None, :] + pick % 2
-        self._ids, source, target, _ = links(free, 2 * grid.resolution_m)
-        self._nodes = np.stack(
+        self.ids, source, target, _ = links(free, 2 * grid.resolution_m)
+        self.cells = row[free], column[free]
+        self.nodes = np.stack(
             (
                 grid.origin_m[0] + (column[free] + 0.5) * grid.resolution_m,
                 grid.origin_m[1] + (row[free] + 0.5) * grid.resolution_m,
             ),
             axis=1,
         )
-        self._node_price = self._price[row[free], column[free]]
-        gaps = self._nodes[source] - self._nodes[target]
-        count = len(self._nodes)
-        self._links = csr_matrix((np.hypot(gaps[:, 0], gaps[:, 1]), (source, target)), shape=(count, count))
-        self._link_source = np.repeat(np.arange(count), np.diff(self._links.indptr))
+        gaps = self.nodes[source] - self.nodes[target]
+        count = len(self.nodes)
+        self.links = csr_matrix((np.hypot(gaps[:, 0], gaps[:, 1]), (source, target)), shape=(count, count))
+        self.link_source = np.repeat(np.arange(count), np.diff(self.links.indptr))
+
+
+class RoutePlanner:
+    """Planner of routes to one goal.
+
+    `near_m`: a route may end within this distance of the goal if people occupy it. `prescribed`: points (m) of a
+    preferred route.
+    """
+
+    def __init__(
+        self, ground: PlannerGround, goal_xy: Vec2, near_m: float = 0.0, prescribed: Sequence[Vec2] = ()
+    ) -> None:
+        self.grid = ground.grid
+        self._goal = goal_xy
+        self._price = ground.prices * self._stray_price(prescribed)
+        self._ids, self._nodes = ground.ids, ground.nodes
+        self._links, self._link_source = ground.links, ground.link_source
+        self._node_price = self._price[ground.cells]
         self._goal_node = self._node(*self._goal)
+        self._ends, self._end_prices = self._ends_near(near_m)
+        self._costs, self._onwards = self._search(np.zeros((0, 2)))
+        self._empty_costs = self._costs
+        self._searched = b""
+
+    def _stray_price(self, prescribed: Sequence[Vec2]) -> Array:
+        """Return the price factor of each cell for leaving the prescribed route."""
+        off = np.ones(self.grid.shape, np.uint8)
+        if not prescribed:
+            return off.astype(np.float64)
+        cells = [self.grid.cell(x, y)[::-1] for x, y in prescribed]
+        cv2.polylines(off, [np.array(cells, np.int32)], isClosed=False, color=0)
+        gap_m = cv2.distanceTransform(off, cv2.DIST_L2, 5) * self.grid.resolution_m
+        return np.asarray(1.0 + _STRAY_PRICE * np.clip(gap_m / _WAY_M - 1.0, 0.0, 1.0), np.float64)
 
     def _node(self, x_m: float, y_m: float) -> int:
         """Return the node of the free cell nearest to a point; -1 if there is none nearby."""

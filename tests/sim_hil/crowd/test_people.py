@@ -11,7 +11,7 @@ import pytest
 
 from sim_hil.crowd.courtesy import Jams
 from sim_hil.crowd.people import GESTURES, UPDATE_HZ, People, appearances
-from sim_hil.crowd.spots import spots_of
+from sim_hil.crowd.spots import Destinations, spots_of
 from sim_hil.crowd.state import Crowd
 from sim_hil.crowd.steering import Nearby, choose
 from sim_hil.crowd.walkable_map import CrowdMap
@@ -58,6 +58,14 @@ def test_the_seed_decides_everything_and_reading_the_state_changes_nothing(corri
     assert np.array_equal(read.render_rows(), unread.render_rows())
     assert not np.array_equal(People(corridor, 5, 3).poses(), People(corridor, 5, 4).poses())
     assert appearances(5, 3) == appearances(5, 3) != appearances(5, 4)
+
+
+@pytest.mark.slow
+def test_crowds_that_share_destinations_leave_nothing_behind_in_them(hospital: Scene) -> None:
+    shared = Destinations.of(hospital, 10, np.random.default_rng(1))
+    first, second = (_walk(People(hospital, 10, 3, shared), 10.0) for _ in range(2))
+    assert np.array_equal(first, second)
+    assert not np.array_equal(first, _walk(People(hospital, 10, 4, shared), 10.0))
 
 
 def test_people_walk_at_walking_speed_without_jumping(corridor: Scene) -> None:

@@ -23,8 +23,8 @@ from sim_hil.benchmark.policies.expert import NEAR, along, driving_of, from_here
 from sim_hil.benchmark.policies.expert_motion import Driving
 from sim_hil.benchmark.policies.expert_route import RoutePlanner
 from sim_hil.benchmark.suite.episode import Episode
-from sim_hil.benchmark.suite.robots import footprint_m, max_step_m
 from sim_hil.crowd.people import UPDATE_HZ, People
+from sim_hil.crowd.spots import Destinations
 from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.simulation.camera import CameraWorld
 from tools.train.collect.record import CameraSettings, NothingToLearnError, Recorded
@@ -55,19 +55,28 @@ _SLOWEST: Final = 0.6  # slowest pace as a share of the expert's speed
 _ALLOWED_MPS: Final = 0.35  # a tour with a lower mean speed is given up
 _SPARE_S: Final = 30.0  # time allowed in addition
 _DECOYS: Final = 8  # attempts to draw a detour
+_TAG: Final = 0x7055
 _THERE_M: Final = 0.25  # distance to the end of a route at which it counts as reached
 
 
 class TourWorld:
     """People and cameras of one layout, reused by its tours.
 
-    The people's appearance is the same in all tours; their positions and paths are each tour's own.
+    The people's appearance and the places they go to are the same in all tours; their positions and paths are each
+    tour's own.
     """
 
     def __init__(self, site: Site, people: int) -> None:
         """`people`: upper limit of their number; a small layout has room for fewer."""
         self.site = site
-        while people and not _has_room(site, people):
+        self._destinations: Destinations | None = None
+        if people:
+            try:
+                rng = np.random.default_rng((site.layout_seed, _TAG))
+                self._destinations = Destinations.of(site.scene, people, rng)
+            except ValueError:  # no floor that people can walk on
+                people = 0
+        while people and not self._has_room(people):
             people //= 2
         self.count = people
         self._people = People(site.scene, 0, 0)
@@ -76,9 +85,17 @@ class TourWorld:
     def fill(self, episode: Episode) -> None:
         """Place new people, none near the start. Raises NothingToLearnError if there is no room."""
         try:
-            self._people = People(replace(self.site.scene, start=episode.start), self.count, episode.seed)
+            scene = replace(self.site.scene, start=episode.start)
+            self._people = People(scene, self.count, episode.seed, self._destinations)
         except ValueError as error:
             raise NothingToLearnError("no room for its people") from error
+
+    def _has_room(self, people: int) -> bool:
+        try:
+            People(self.site.scene, people, self.site.layout_seed, self._destinations)
+        except ValueError:
+            return False
+        return True
 
     def people(self) -> Array:
         """Return the people's poses [n, 3]: x m, y m, heading rad."""
@@ -241,8 +258,7 @@ class _Tour:
         self.plan: list[Vec2] = []
 
     def _planner_to(self, goal: Vec2, near_m: float, described: tuple[Vec2, ...] = ()) -> RoutePlanner:
-        robot = self._robot
-        return RoutePlanner(self._site.scene, goal, footprint_m(robot), max_step_m(robot), near_m, described)
+        return RoutePlanner(self._site.planner_ground(self._robot), goal, near_m, described)
 
     def _drawn_detour(self) -> tuple[DetourProgress, RoutePlanner] | None:
         """Draw a detour and its planner; None if the tour has none."""
@@ -280,7 +296,8 @@ class _Tour:
             self._route = self._planner.route(self._here, standing, _REACH_M, kept)
             if self._detour is not None and self._detour[0].active:
                 self._detour_route = self._detour[1].route(self._here, standing, _REACH_M)
-        self.plan = along(self._route, pose, self.body.speed_mps, self.body.driving, PLAN_TIMES_S)
+            # Kept until the next frame with a picture: only those are learned from.
+            self.plan = along(self._route, pose, self.body.speed_mps, self.body.driving, PLAN_TIMES_S)
 
     def _standing(self) -> Array:
         people, velocities, pose = self._world.people()[:, :2], self._world.velocities(), self.body.pose
@@ -317,14 +334,6 @@ class _Tour:
         blocked = bool(np.any((np.hypot(dx, dy) < _BLOCKED_M) & (np.abs(bearings) < _BLOCKED_RAD)))
         self._blocked_s = self._blocked_s + _STEP_S if blocked else 0.0
         return 0.0 < self._blocked_s < _PATIENCE_S
-
-
-def _has_room(site: Site, people: int) -> bool:
-    try:
-        People(site.scene, people, site.layout_seed)
-    except ValueError:
-        return False
-    return True
 
 
 def _slew(value: float, target: float, down: float, up: float) -> float:

@@ -12,14 +12,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
-from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from edge.core.geometry import SE2
 from edge.state.reasoning_text import Progress
 from sim_hil.benchmark.language.openings import Frame
 from sim_hil.benchmark.language.route import Step
-from sim_hil.scene.nav_grid import NavGrid, links
+from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.scene.scene import Vec2
 from tools.train.drives.scenarios import Scenario
 
@@ -163,16 +162,14 @@ def _nearest_points(grid: NavGrid, points: Array) -> tuple[NDArray[np.int64], Ar
 
     Both are [rows, columns]. Cells that are occupied or too far away take the values of the nearest reachable cell.
     """
-    ids, source, target, length = links(grid.free, grid.resolution_m)
+    ids, _, graph = grid.graph
     first: dict[int, int] = {}
     for index, (x, y) in enumerate(points):
         first.setdefault(int(ids[grid.free_cell(float(x), float(y))]), index)
-    count = int(grid.free.sum())
-    graph = csr_matrix((length, (source, target)), shape=(count, count))
     gaps, _, sources = dijkstra(
         graph, directed=False, indices=list(first), min_only=True, return_predecessors=True, limit=_REACH_M
     )  # fmt: skip
-    index_of = np.zeros(count, np.int64)
+    index_of = np.zeros(len(gaps), np.int64)
     index_of[list(first)] = list(first.values())
     reached, nearest, gap = np.zeros(grid.shape, bool), np.zeros(grid.shape, np.int64), np.zeros(grid.shape)
     reached[grid.free] = np.isfinite(gaps)

@@ -20,6 +20,7 @@ from sim_hil.benchmark.language.route import RouteDescription, RouteError
 from sim_hil.benchmark.language.task_checks import named_landmarks, named_too_small, worst_leak, wrong_bends
 from sim_hil.benchmark.language.tasks import Task, goals, make_task, sample_task
 from sim_hil.benchmark.language.visibility import Sightlines
+from sim_hil.benchmark.policies.expert_route import PlannerGround
 from sim_hil.benchmark.suite.build import timeout_s
 from sim_hil.benchmark.suite.episode import ROBOTS, Episode
 from sim_hil.benchmark.suite.robots import robot_grid, route_grid
@@ -53,6 +54,7 @@ class Site:
         # The name begins with the kind, which determines the people's clothes.
         self.scene: Scene = replace(made, name=f"{kind}-{layout_seed}")
         self._robot_grids: dict[str, NavGrid] = {}
+        self._planner_grounds: dict[str, PlannerGround] = {}
 
     @property
     def outdoors(self) -> bool:
@@ -88,6 +90,12 @@ class Site:
         if robot not in self._robot_grids:
             self._robot_grids[robot] = robot_grid(self.scene, robot)
         return self._robot_grids[robot]
+
+    def planner_ground(self, robot: str) -> PlannerGround:
+        """Return what planners of a robot's routes in this scene share. Raises ValueError for an unknown robot."""
+        if robot not in self._planner_grounds:
+            self._planner_grounds[robot] = PlannerGround(self.scene, self.robot_grid(robot))
+        return self._planner_grounds[robot]
 
 
 def corridor(layout_seed: int) -> Scene:

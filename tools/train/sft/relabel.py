@@ -29,7 +29,6 @@ from sim_hil.benchmark.language.route import RouteError
 from sim_hil.benchmark.language.tasks import begins_ahead, make_task
 from sim_hil.benchmark.policies.expert import NEAR, along, driving_of, from_here
 from sim_hil.benchmark.policies.expert_route import RoutePlanner
-from sim_hil.benchmark.suite.robots import footprint_m, max_step_m
 from sim_hil.layouts import LayoutError
 from sim_hil.scene.scene import SceneObject, Vec3
 from tools.train.config.checks import TrainError
@@ -265,11 +264,9 @@ def _shown_frames(drive: Drive, scenario: Scenario, progress: RouteProgress) -> 
 def _plans(drive: Drive, scenario: Scenario, speed_mps: float, count: int) -> NDArray[np.float32] | None:
     """Return positions on the route in 3, 6 and 9 s from every frame [count, 3, 2]; None if the goal is unreachable."""
     episode = scenario.episode
-    robot, goal_xy = episode.robot, episode.goal_xy
-    planner = RoutePlanner(
-        scenario.scene, goal_xy, footprint_m(robot), max_step_m(robot), NEAR * episode.threshold_m, scenario.task.path
-    )
-    driving = replace(driving_of(robot), speed_mps=speed_mps)
+    ground = scenario.site.planner_ground(episode.robot)
+    planner = RoutePlanner(ground, episode.goal_xy, NEAR * episode.threshold_m, scenario.task.path)
+    driving = replace(driving_of(episode.robot), speed_mps=speed_mps)
     plan = np.zeros((count, len(PLAN_TIMES_S), 2), np.float32)
     route = np.zeros((0, 2))
     for k in range(count):

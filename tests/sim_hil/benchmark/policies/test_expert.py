@@ -13,7 +13,7 @@ from sim_hil.benchmark.env.metrics import Outcome
 from sim_hil.benchmark.env.world import EpisodeWorld
 from sim_hil.benchmark.policies.expert import ExpertPolicy
 from sim_hil.benchmark.policies.expert_motion import STEPS, Driving, Motion
-from sim_hil.benchmark.policies.expert_route import SPACING_M, RoutePlanner
+from sim_hil.benchmark.policies.expert_route import SPACING_M, PlannerGround, RoutePlanner
 from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.scene.scene import Scene, Vec2
 from tests.support.benchmark.benchmark_episodes import block, corridor_episode, hall
@@ -105,9 +105,13 @@ def test_a_goal_without_a_way_to_it_is_refused() -> None:
         ExpertPolicy().reset(episode, "Go.", world, 0)
 
 
+def ground(scene: Scene, clearance_m: float = 0.33, max_step_m: float = 0.06) -> PlannerGround:
+    return PlannerGround(scene, NavGrid(scene, clearance_m=clearance_m, max_step_m=max_step_m))
+
+
 def planner() -> RoutePlanner:
     # Two ways round a block in the middle, the lower one shorter.
-    return RoutePlanner(hall(block(0.0, 0.6, 1.0, 4.0)), (6.0, 0.0), 0.33, 0.06)
+    return RoutePlanner(ground(hall(block(0.0, 0.6, 1.0, 4.0))), (6.0, 0.0))
 
 
 def test_a_route_is_evenly_spaced_keeps_its_room_and_leads_to_the_goal() -> None:
@@ -166,7 +170,7 @@ def test_a_person_right_ahead_is_not_driven_into() -> None:
 
 def test_where_people_take_the_goal_up_being_near_it_is_enough() -> None:
     around = np.array([(6.0, 0.0), (6.0, 0.9), (6.0, -0.9)])
-    exact, near = (RoutePlanner(hall(), (6.0, 0.0), 0.33, 0.06, near_m) for near_m in (0.0, 1.2))
+    exact, near = (RoutePlanner(ground(hall()), (6.0, 0.0), near_m) for near_m in (0.0, 1.2))
     assert np.allclose(exact.route((0.0, 0.0), around, 20.0)[-1], (6.0, 0.0), atol=0.15)
     end = near.route((0.0, 0.0), around, 20.0)[-1]
     assert 0.5 < hypot(end[0] - 6.0, end[1]) < 1.25
@@ -183,7 +187,7 @@ NARROW = hall(block(0.0, 0.0, 1.0, 1.0))
 
 
 def _prescribed(points: tuple[Vec2, ...]) -> np.ndarray:
-    return RoutePlanner(BLOCKED, GOAL, 0.3, 0.05, prescribed=points).route(START, NOBODY, 20.0)
+    return RoutePlanner(ground(BLOCKED, 0.3, 0.05), GOAL, prescribed=points).route(START, NOBODY, 20.0)
 
 
 def test_without_a_prescribed_route_it_takes_the_shorter_one() -> None:

@@ -12,7 +12,6 @@ from edge.core.geometry import SE2
 from edge.state.reasoning_text import Progress
 from sim_hil.benchmark.language.openings import Frame
 from sim_hil.benchmark.policies.expert_route import RoutePlanner
-from sim_hil.benchmark.suite.robots import footprint_m, max_step_m
 from tests.support.train.training_scenarios import all_scenarios, progress_of, scenarios
 from tools.train.config.collect import CORRIDOR, KINDS
 from tools.train.drives.progress_labels import RouteProgress
@@ -33,8 +32,8 @@ def _told_way(scenario: Scenario) -> Points:
 def _expert_way(scenario: Scenario) -> Points:
     """Where the expert drives when nobody is about: with room to the walls."""
     episode = scenario.episode
-    clearance_m, step_m = footprint_m(episode.robot), max_step_m(episode.robot)
-    planner = RoutePlanner(scenario.scene, episode.goal_xy, clearance_m, step_m, 0.8 * episode.threshold_m)
+    ground = scenario.site.planner_ground(episode.robot)
+    planner = RoutePlanner(ground, episode.goal_xy, 0.8 * episode.threshold_m)
     line = planner.route(episode.start[:2], np.zeros((0, 2)), 150.0)
     return [(float(x), float(y)) for x, y in line]
 
