@@ -244,7 +244,12 @@ def tour_anchors(tours: Dataset, ids: tuple[str, ...]) -> Iterator[Anchor]:
         clear = {int(trace["k"]) for trace in drive.traces if not _is_blocked(parse_people(str(trace["motion"])))}
         for anchor in anchors_of(drive):
             if anchor.k in clear:
-                yield replace(anchor, around=(), by_seconds=True)
+                yield of_tour(anchor)
+
+
+def of_tour(anchor: Anchor) -> Anchor:
+    """Return an anchor whose drive is a tour, which has images at whole seconds alone."""
+    return replace(anchor, around=(), by_seconds=True)
 
 
 def _is_blocked(people: Sequence[SeenPerson]) -> bool:

@@ -57,12 +57,16 @@ class ShowConfig(Checked):
 
 @dataclass(frozen=True)
 class RelabelConfig(Checked):
-    """Relabelling of drives with instructions for other goals."""
+    """Relabelling of drives and tours with instructions for other goals."""
 
     ways: Annotated[int, Range(0, 64)] = 0
     """Upper limit of other instructions per drive; 0: none."""
+    tour_ways: Annotated[int, Range(0, 64)] = 0
+    """The same per tour."""
     tries: Annotated[int, Range(0, 1000)] = 24
-    """Random goals that are tried per drive."""
+    """Random goals that are tried per drive or tour."""
+    off_m: Annotated[float, Range(1, 20)] = 3.0
+    """A relabel ends at this distance from its route, m: the farther, the more of it shows a robot that is lost."""
 
 
 @dataclass(frozen=True)

@@ -241,11 +241,12 @@ def _sft(config: SftConfig, seconds: int) -> Work:
     if not config.tours.count:
         return drives
     toured = round(_TOUR_S * config.tours.count)
+    retoured = round(toured * deciding * (1 + _RELABELLED * config.retold.tour_ways))
     return [
         *drives,
         (f"{_OF_TOURS}made", config.tours.count, "tour"),
         (f"{_OF_TOURS}frames encoded", toured * (2 if config.mirrored > 0 else 1), "encode"),
-        (f"{_OF_TOURS}anchors learned", round(toured * deciding) * config.epochs, "sft"),
+        (f"{_OF_TOURS}anchors learned", retoured * config.epochs, "sft"),
     ]
 
 

@@ -1,4 +1,4 @@
-"""Relabelling of drives with instructions for other goals: other routes from the same start and their true texts.
+"""Relabelling of drives and tours with instructions for other goals: other routes from the same start, true texts.
 
 A drive follows one of many routes that its first images allow. A model that sees every corridor with one instruction
 memorises the corridor and its turn; with several instructions it must read them. Behind the point where the drive
@@ -47,7 +47,6 @@ FOLDER: Final = "retold"
 FORMAT: Final = 2
 LEAST_FRAMES: Final = 50
 """Shortest useful relabel, frames."""
-_OFF_M: Final = 3.0  # a relabel ends at this distance from its route, so that missed turns do not dominate
 _APART_M: Final = 2.0  # smallest distance between two goals
 _FREE: Final = 0.9  # least share of a drive's poses on free floor if the scene is unchanged; policies touch walls
 _ARRIVE_SHARE: Final = 0.7  # share of the success distance at which a relabel ends, as drives do
@@ -110,7 +109,8 @@ class InstructionRelabels:
 
     def __init__(self, dataset: Dataset, config: RelabelConfig, seed: int, speed_mps: float) -> None:
         """Open the existing relabels; `build` computes missing ones. `speed_mps`: the expert's speed."""
-        numbers = {"format": FORMAT, "seed": seed, "speed_mps": speed_mps, **asdict(config)}
+        per_drive = {"ways": config.ways, "tries": config.tries, "off_m": config.off_m}
+        numbers = {"format": FORMAT, "seed": seed, "speed_mps": speed_mps, **per_drive}
         self.key = hashlib.sha256(json.dumps(numbers, sort_keys=True).encode()).hexdigest()
         self.folder = dataset.folder / FOLDER / self.key[:16]
         self._dataset, self._config, self._seed, self._speed_mps = dataset, config, seed, speed_mps
@@ -191,7 +191,7 @@ def relabel(drive: Drive, site: Site, config: RelabelConfig, seed: int, speed_mp
         if len(found) >= config.ways:
             break
         scenario = _to(site, start, thing, drive, int(rng.integers(2**31)))
-        if scenario is not None and (one := relabel_along(drive, scenario, speed_mps, lines)) is not None:
+        if scenario is not None and (one := relabel_along(drive, scenario, speed_mps, config.off_m, lines)):
             found.append(one)
     return found
 
@@ -218,14 +218,14 @@ def _to(site: Site, start: Vec3, thing: SceneObject, drive: Drive, wording_seed:
 
 
 def relabel_along(
-    drive: Drive, scenario: Scenario, speed_mps: float, lines: Sight | None = None
+    drive: Drive, scenario: Scenario, speed_mps: float, off_m: float, lines: Sight | None = None
 ) -> InstructionRelabel | None:
     """Relabel a drive with a scenario that has the same start; None if fewer than LEAST_FRAMES frames are usable.
 
-    It ends where the drive is 3 m off the scenario's route, or has arrived. `lines`: see `Tracer`.
+    It ends where the drive is `off_m` from the scenario's route, or has arrived. `lines`: see `Tracer`.
     """
     progress = RouteProgress(scenario)
-    count = _shown_frames(drive, scenario, progress)
+    count = _shown_frames(drive, scenario, progress, off_m)
     plan = _plans(drive, scenario, speed_mps, count) if count >= LEAST_FRAMES else None
     if plan is None:
         return None
@@ -249,12 +249,12 @@ def _with_people(alone: ReasoningText, own: ReasoningText) -> ReasoningText:
     return five_aspects(own.situation, alone.objects or (), own.people or (), alone.progress, alone.plan)
 
 
-def _shown_frames(drive: Drive, scenario: Scenario, progress: RouteProgress) -> int:
+def _shown_frames(drive: Drive, scenario: Scenario, progress: RouteProgress, off_m: float) -> int:
     """Count a drive's frames until it arrives at the other goal, or is too far from the route to it."""
     x, y = scenario.episode.goal_xy
     near = np.hypot(drive.pose[:, 0] - x, drive.pose[:, 1] - y) < _ARRIVE_SHARE * scenario.episode.threshold_m
     for k in range(len(drive)):
-        if progress.strayed_m(drive.T_world_base(k)) > _OFF_M:
+        if progress.strayed_m(drive.T_world_base(k)) > off_m:
             return k
         if near[k]:
             return k + 1

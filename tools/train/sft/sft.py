@@ -19,7 +19,7 @@ from tokenizers import Tokenizer
 from edge.state.reasoning_text import format_text
 from export.checkpoint.tokenizer import tokenizer_for
 from export.model.network import TicVla
-from tools.train.collect.collection import build_tours, tour_anchors
+from tools.train.collect.collection import build_tours, of_tour, tour_anchors
 from tools.train.config.checks import OptimConfig, TrainError
 from tools.train.config.sft import DrawConfig, SftConfig, ShowConfig
 from tools.train.drives.drive import Dataset
@@ -126,12 +126,13 @@ def run(job: StageJob) -> dict[str, Any]:
         mirror = TokenCache(SecondsDataset.of(dataset, mirrored=True), network.vision, dataset.folder / MIRRORED)
         _encode(job, mirror, dataset.train)
     job = replace(job, recipe=replace(job.recipe, sft=replace(config, epochs=epochs, optim=optim)))
-    more = _relabelled(job, dataset) if config.retold.ways else []
+    more = _relabelled(job, dataset, dataset.train, config.retold.ways)
     views = Views(plain, mirror)
     if config.tours.count:
         tours = _tours(job, dataset)
         views = _with_tours(job, network, views, tours)
         more += tour_anchors(tours, tours.ids)
+        more += map(of_tour, _relabelled(job, tours, tours.ids, config.retold.tour_ways))
     result = fit(job, network.to(job.device), dataset, views, more)
     if job.ranks.first:
         finish_network(job, STAGE, network.cpu())
@@ -274,13 +275,16 @@ def _with_tours(job: StageJob, network: TicVla, views: Views, tours: Dataset) ->
     return Views(views.plain, mirror, seconds)
 
 
-def _relabelled(job: StageJob, dataset: Dataset) -> list[Anchor]:
-    """Return the anchors of relabelled training drives; missing relabels are computed."""
+def _relabelled(job: StageJob, dataset: Dataset, ids: tuple[str, ...], ways: int) -> list[Anchor]:
+    """Return the anchors of these drives under other instructions; missing relabels are computed."""
+    if not ways:
+        return []
     recipe = job.recipe
-    relabels = InstructionRelabels(dataset, recipe.sft.retold, recipe.seed, recipe.collect.speed_mps)
+    config = replace(recipe.sft.retold, ways=ways)
+    relabels = InstructionRelabels(dataset, config, recipe.seed, recipe.collect.speed_mps)
     job.progress.log("relabelling drives")
-    relabels.build(dataset.train, ranks=job.ranks, progress=job.progress, stopped=lambda: job.stop.requested)
-    return [anchor for drive in dataset.drives(dataset.train, pictures=False) for anchor in relabels.anchors(drive)]
+    relabels.build(ids, ranks=job.ranks, progress=job.progress, stopped=lambda: job.stop.requested)
+    return [anchor for drive in dataset.drives(ids, pictures=False) for anchor in relabels.anchors(drive)]
 
 
 def _waiting(dataset: Dataset, ids: Sequence[str]) -> Iterator[Anchor]:

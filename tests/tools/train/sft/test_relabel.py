@@ -58,7 +58,7 @@ KINDS = ("corridor", "office", "sidewalk")
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_relabel_with_its_own_route_equals_the_drive(kind: str) -> None:
     scenario, drive, _ = _told(kind)
-    own = relabel_along(drive, scenario, SPEED_MPS)
+    own = relabel_along(drive, scenario, SPEED_MPS, CONFIG.off_m)
     assert own is not None and own.wordings == drive.wordings and own.told == drive.about.told
     assert len(own.traces) > 4 and list(own.traces) == list(drive.traces[: len(own.traces)])
     # It ends where it arrives.
@@ -97,7 +97,7 @@ def test_a_relabel_has_the_drives_frames_up_to_where_it_is_far_from_the_other_wa
         assert [trace["k"] for trace in other.traces] == list(range(0, len(other), 10))
         assert not other.future_steps.any()  # what to do among people is not known of this way
         progress = RouteProgress(replace(scenario, task=_tasks(kind)[each.goal_xy]))
-        assert max(progress.strayed_m(other.T_world_base(k)) for k in range(0, len(other), 10)) <= 3.0
+        assert max(progress.strayed_m(other.T_world_base(k)) for k in range(0, len(other), 10)) <= CONFIG.off_m
 
 
 @pytest.mark.slow
@@ -131,6 +131,14 @@ def test_past_a_turn_that_was_missed_it_turns_back_and_not_before() -> None:
                 off_m = off_way_m(drive.pose[trace["k"], :2], path)
                 said["after" if off_m > 2.0 else "before"].add(trace["plan"])
     assert "turn back" in said["after"] and len(said["before"] - {"turn back"}) > 10
+
+
+@pytest.mark.slow
+def test_a_greater_distance_shows_more_of_a_robot_that_is_lost() -> None:
+    scenario, drive, found = _told("office")
+    farther = relabel(drive, scenario.site, replace(CONFIG, off_m=8.0), 1, SPEED_MPS)
+    backs = [sum(trace["plan"] == "turn back" for each in some for trace in each.traces) for some in (found, farther)]
+    assert backs[1] > backs[0]
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from tests.support.train.train_stage_contract import Run, StageContract
 from tools.train.config.checks import OptimConfig, TrainError
 from tools.train.config.collect import CollectConfig, TourConfig
 from tools.train.config.recipe import load_recipe
-from tools.train.config.sft import SftConfig
+from tools.train.config.sft import RelabelConfig, SftConfig
 from tools.train.drives.drive import Dataset
 from tools.train.pipeline.chain import Step, budget_of, run_step
 from tools.train.run.job import StageJob
@@ -146,3 +147,19 @@ def test_tours_are_made_and_learned_from_beside_the_drives(tmp_path: Path) -> No
     assert 0 < result["more_anchors"] <= sum(entry.frames // 10 + 1 for entry in made.entries)
     assert {entry.driver for entry in made.entries} == {"tour"}
     assert not set(made.ids) & set(Dataset.open(tmp_path / "collect").ids)
+
+
+@pytest.mark.slow
+def test_tours_are_learned_from_under_other_instructions_too(tmp_path: Path) -> None:
+    small_dataset(tmp_path / "collect")
+    silent = dataclasses.replace(CONFIG.evaluate, anchors=0, epoch_anchors=0, drives=0)
+    tours = TourConfig(count=2, per_layout=2, people_most=0)
+    numbers = dataclasses.replace(CONFIG, epochs=1, evaluate=silent, mirrored=0.0, tours=tours)
+    retold = dataclasses.replace(numbers, retold=RelabelConfig(tour_ways=2))
+    found = []
+    for name, config in (("once", numbers), ("retold", retold)):
+        job = sft_job(tmp_path / name, config)
+        shutil.copytree(tmp_path / "collect", tmp_path / name / "collect")
+        recipe = dataclasses.replace(job.recipe, collect=CollectConfig(kinds={"corridor": 1.0}, jobs=1))
+        found.append(run(dataclasses.replace(job, recipe=recipe))["more_anchors"])
+    assert found[1] > found[0] > 0
