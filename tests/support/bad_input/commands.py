@@ -261,6 +261,8 @@ TOOLS: Final = (
         {"--artifacts": directories, "--out": output_directories, "--variants": texts("nope", "\x1b[2J"),
          "--episodes": numbers("-1", "0", "1.5"), "--latency": numbers("-1", "0"), "--jobs": numbers("-1", "0"),
          "--json": outputs}),
+    Command("tools.findings.lost", "tools.findings.lost", "--split {folder}/no-split",
+        {"--split": directories, "--variant": choices, "--json": outputs}, says=("no-split",)),
     Command("tools.findings.models", "tools.findings.models", "--run {folder}/no-run --out {folder}/models",
         {"--run": directories, "--ablations": directories, "--out": output_directories},
         says=("no run of edge-train",)),
