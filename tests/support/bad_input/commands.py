@@ -221,7 +221,7 @@ TABLE: Final = (
         {"--out": output_directories, "--drives": directories, "--from": directories,
          "--checkpoint": other_files(".safetensors"),
          "--device": texts("", "nope", "cuda:x", "cpu:1", "\x1b[2J"), "--after": texts("nope"),
-         "--json": outputs}, notes=2,
+         "--json": outputs}, notes=2, preload=("torch._inductor.config",),  # what deterministic algorithms load
     ),
     _console("edge-train", "card", "card --out {folder}/run", {"--out": directories, "--scores": json_files,
          "--ship": output_directories}, says=("train first", "folder of a run")),
