@@ -216,9 +216,9 @@ class ControlLoop:
         latency: LatencyInput | None = None
         now_ns = self._clock()
         if semantic is not None and pose is not None and encoded is not None:
+            trained_s = self._config.trained_delay_s
+            latency, now_ns, called_ns = semantic.latency_input_at_call(self._clock, pose.T_odom_base, trained_s)
             delay_s = semantic.delay_s(now_ns)
-            latency = semantic.latency_input(now_ns, pose.T_odom_base, self._config.trained_delay_s)
-            called_ns = self._clock()
             trajectory = self._act(encoded, pose, latency, semantic)
             self.statistics.plans += 1
             self.statistics.plans_not_finite += not is_plan(trajectory)

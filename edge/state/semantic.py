@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,6 +13,11 @@ import numpy.typing as npt
 from edge.core.geometry import SE2
 from edge.state.reasoning_text import WAYPOINT_TIMES_S, Waypoints, plans_to_wait
 from edge.state.ring import TokenRing
+
+PREEMPTED_NS = 500_000
+"""A Δt older than this when the action expert is called is taken again, ns: half of what a prompt resolves."""
+CLOCK_READINGS = 3
+"""Most times that it is taken."""
 
 STRAIGHT_AHEAD: Waypoints = tuple((time_s / 2, 0.0) for time_s in WAYPOINT_TIMES_S)
 """Waypoints at 0.5 m/s, with which graphs are warmed up and timed."""
@@ -68,6 +73,21 @@ class SemanticState:
         """Return the motion offset and Δt clamped to 0..`trained_delay_s`, the largest in the policy's training."""
         delay_s = min(max(self.delay_s(now_ns), 0.0), trained_delay_s)
         return LatencyInput(delay_s, self.motion_offset(T_odom_base))
+
+    def latency_input_at_call(
+        self, clock: Callable[[], int], T_odom_base: SE2, trained_delay_s: float
+    ) -> tuple[LatencyInput, int, int]:
+        """Return the input for a call that follows at once, the time of its Δt, and the time now, ns.
+
+        A thread that lost the processor in between takes the time again.
+        """
+        for _ in range(CLOCK_READINGS):
+            now_ns = clock()
+            latency = self.latency_input(now_ns, T_odom_base, trained_delay_s)
+            called_ns = clock()
+            if called_ns - now_ns < PREEMPTED_NS:
+                break
+        return latency, now_ns, called_ns
 
 
 def waypoints_now(waypoints: Waypoints, offset: SE2) -> npt.NDArray[np.float32]:

@@ -50,6 +50,28 @@ def test_the_delay_is_taken_when_the_action_expert_is_called_not_when_the_tick_b
     assert bench.policy.calls[-1][0] == pytest.approx(0.040)
 
 
+@pytest.mark.parametrize(("pauses_ms", "error_ms"), [((3.0,), 0.0), ((3.0, 3.0), 0.0), ((3.0, 3.0, 3.0, 3.0), 3.0)])
+def test_a_thread_that_loses_the_processor_takes_the_delay_again(
+    bench: Bench, pauses_ms: tuple[float, ...], error_ms: float
+) -> None:
+    bench.see()
+    bench.think(0)
+    state = bench.slot.state
+    assert state is not None
+    pauses, now_ns = list(pauses_ms), bench.now_ns
+
+    def clock() -> int:
+        """Every second reading comes after a pause."""
+        nonlocal now_ns, read
+        read += 1
+        now_ns += round((pauses.pop(0) if read % 2 == 0 and pauses else 0.0) * 1e6)
+        return now_ns
+
+    read = 0
+    latency, then_ns, called_ns = state.latency_input_at_call(clock, SE2(0.0, 0.0, 0.0), 10.0)
+    assert (called_ns - then_ns) / 1e6 == error_ms and latency.delay_s == state.delay_s(then_ns)
+
+
 def test_a_frame_is_encoded_once_however_often_it_is_used(bench: Bench) -> None:
     bench.see()
     bench.tick()
