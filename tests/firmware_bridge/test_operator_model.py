@@ -247,6 +247,7 @@ def run(max_examples: int) -> None:
     sys.stdout.write("{} commands, {} core steps, {} stops and {} arms confirmed\n".format(*found))
 
 
+@pytest.mark.slow
 def test_what_an_operator_is_told_is_true() -> None:
     run(8)
     assert OperatorMachine.commands >= 60

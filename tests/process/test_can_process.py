@@ -21,6 +21,7 @@ def _drive(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=90, check=False)
 
 
+@pytest.mark.slow
 def test_a_session_over_a_serial_line_arms_drives_and_stops(tmp_path: Path) -> None:
     line, result = tmp_path / "can", tmp_path / "hil.json"
     link = f"serial:{line},camera=0"

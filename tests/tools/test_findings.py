@@ -217,6 +217,7 @@ def test_a_page_a_picture_and_json_are_written(
     assert (out / "findings.png").stat().st_size > 0 and (out / "latency.png").stat().st_size > 0
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_is_reported_as_far_as_it_has_results(
     tmp_path: Path, suite: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -229,6 +230,7 @@ def test_an_interrupted_run_is_reported_as_far_as_it_has_results(
     assert "SR of the shipped model" in page and "rl-sync: 0 of 30 episodes so far" in page
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ends", "code"),
     [
@@ -252,6 +254,7 @@ def test_one_failed_run_does_not_end_the_others(
     assert ("* rl-swapped: swapped instructions: expected two tasks" in page) == (code == EXIT_DONE)
 
 
+@pytest.mark.slow
 def test_the_suite_that_training_writes_is_taken(tmp_path: Path, capsys: Any) -> None:
     suite = write_suite(tmp_path / "evaluate", EvaluateConfig(episodes=2, kinds={"corridor": 1.0}))
     root = models(tmp_path / "models", "rl")

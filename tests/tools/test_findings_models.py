@@ -34,6 +34,7 @@ def command(tmp_path: Path) -> list[str]:
     return ["bash", str(script)]
 
 
+@pytest.mark.slow
 def test_a_run_gives_the_model_before_and_after_ppo_and_its_ablations(tmp_path: Path) -> None:
     run = run_of(tmp_path / "run", "encoder", "sft", "imitate", "rl")
     run_of(tmp_path / "ablations" / "no-latency", "imitate", variant="no-latency")

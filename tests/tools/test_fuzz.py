@@ -79,6 +79,7 @@ def test_the_same_seed_makes_the_same_inputs() -> None:
     assert [mutated(b"abcdef", one) for _ in range(50)] == [mutated(b"abcdef", other) for _ in range(50)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("decoder", sorted(command.ROBOTS))
 def test_nothing_is_found_in_a_few_inputs(decoder: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert command.main(["--decoder", decoder, "--inputs", "3000", "--seed", "1"]) == 0

@@ -119,6 +119,7 @@ def test_the_machine_is_the_one_the_run_was_measured_on(html: str) -> None:
     assert _row_of(html.split("<h2>Machine</h2>")[1], "processor") == ["processor", "Synthetic 9000"]
 
 
+@pytest.mark.slow
 @given(st.integers(0, 60), st.integers(2, 12))
 def test_spread_takes_the_first_the_last_and_no_more_than_asked(items: int, count: int) -> None:
     chosen = spread([{"n": n} for n in range(items)], count)
@@ -165,6 +166,7 @@ def _outside_its_tick(ticks: list[dict[str, Any]], semantics: list[dict[str, Any
     ticks[-1]["delay_s"] += 0.06
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spoil", "note"), [(_without_anchor_frame, "is not in the log"), (_outside_its_tick, "outside the tick")]
 )
@@ -175,6 +177,7 @@ def test_a_tick_that_cannot_be_checked_fails_the_delay_check(tmp_path: Path, spo
     assert not found.passed and note in found.note
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "spoil",
     [
@@ -192,6 +195,7 @@ def test_only_the_newest_released_generation_counts(
     assert _checks_of(tmp_path, ticks=ticks)["stale_generation_ticks"].value == 1
 
 
+@pytest.mark.slow
 def test_a_fault_of_the_runner_fails_and_is_shown(tmp_path: Path) -> None:
     synthetic_run.write_run(tmp_path)
     result = {**synthetic_run.run_result(12.0), "faults": ["the bridge stopped the robot: deadman"]}
@@ -201,6 +205,7 @@ def test_a_fault_of_the_runner_fails_and_is_shown(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "demo.json").read_text())["checks"]["faults"]["pass"] is False
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spoil", "check"),
     [
@@ -217,11 +222,13 @@ def test_bad_ticks_fail_their_check(tmp_path: Path, spoil: Callable[[list[dict[s
     assert check in _failed(_checks_of(tmp_path, ticks=ticks))
 
 
+@pytest.mark.slow
 def test_a_runner_that_ended_early_is_judged_by_the_requested_time(tmp_path: Path) -> None:
     found = _checks_of(tmp_path, asked_s=60.0)
     assert found["control_ticks"].limit == 590 and not found["control_ticks"].passed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("beside_m", "reached"), [(1.4, True), (1.6, False)])
 @pytest.mark.parametrize("share", [0.5, 1.0], ids=["passed on the way", "at the end"])
 def test_trained_weights_must_reach_the_goal(tmp_path: Path, share: float, beside_m: float, reached: bool) -> None:
@@ -240,17 +247,20 @@ def test_the_goal_is_not_required_of_untrained_weights_or_short_runs(
     assert "goal_nearest_m" not in _checks_of(tmp_path, asked_s=duration_s, trained=trained)
 
 
+@pytest.mark.slow
 def test_a_path_without_commands_does_not_count_as_walking(tmp_path: Path) -> None:
     trace = [line for line in synthetic_run.trace_lines(12.0) if line.get("name") != "Move"]
     found = _checks_of(tmp_path, trace=trace)
     assert found["moved_under_command_m"].value == 0.0 and not found["moved_under_command_m"].passed
 
 
+@pytest.mark.slow
 def test_path_under_command_is_the_ground_truth(tmp_path: Path) -> None:
     value = _checks_of(tmp_path)["moved_under_command_m"].value
     assert value == pytest.approx(synthetic_run.SPEED_MPS * 9.0, rel=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("last", "zero"),
     [

@@ -120,6 +120,7 @@ def test_a_table_without_results_is_a_failure(tmp_path: Path) -> None:
     assert split.main(["--out", str(tmp_path), "--report"]) == EXIT_CHECK_FAILED
 
 
+@pytest.mark.slow
 def test_a_run_of_other_artifacts_or_latency_is_not_continued(tmp_path: Path) -> None:
     split.check_same_run(tmp_path, "a" * 64, 1.0)
     split.check_same_run(tmp_path, "a" * 64, 1.0)

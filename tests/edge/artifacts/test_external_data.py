@@ -97,6 +97,7 @@ def test_a_graph_given_twice_hides_nothing() -> None:
     assert [data.location for data in external_data(merged)] == ["hidden"]
 
 
+@pytest.mark.slow
 def test_a_graph_of_empty_nodes_takes_no_multiple_of_its_size_in_memory() -> None:
     model = field(GRAPH, field(NODE, b"") * 20_000)
     tracemalloc.start()

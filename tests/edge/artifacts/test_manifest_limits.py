@@ -103,18 +103,21 @@ class TestTensors:
         extra = {"name": "extra", "dtype": "float", "shape": shape}
         return lambda m: m["graphs"]["action_expert"]["outputs"].append(extra)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("shape", [[1 << 31], ["N", 1 << 16, 1 << 15], [1], []])
     def test_one_of_2_to_the_31_elements_is_taken(self, copy: Path, shape: object) -> None:
         edit_manifest(copy, self.with_output(shape))
         output = load_artifacts(copy).graphs["action_expert"].output("extra")
         assert output == TensorContract("extra", "float", tuple(shape))  # type: ignore[arg-type]
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("shape", [[(1 << 31) + 1], [1 << 16, 1 << 16], [0], [-1], [True], [1.5], [None]], ids=str)
     def test_a_larger_or_senseless_one_is_refused_by_its_shape(self, copy: Path, shape: list[object]) -> None:
         edit_manifest(copy, self.with_output(shape))
         with pytest.raises(ArtifactError, match="graph action_expert: outputs has a tensor of shape"):
             load_artifacts(copy)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         "entry",
         [5, {"name": "x", "dtype": "float"}, {"name": "x", "dtype": "float", "shape": "3"},
@@ -126,6 +129,7 @@ class TestTensors:
         with pytest.raises(ArtifactError, match="graph action_expert: outputs must be name, dtype and shape"):
             load_artifacts(copy)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("key", ["inputs", "outputs"])
     @pytest.mark.parametrize("value", [None, {}, "x"])
     def test_a_graph_without_them_is_refused(self, copy: Path, key: str, value: object) -> None:
@@ -133,6 +137,7 @@ class TestTensors:
         with pytest.raises(ArtifactError, match=f"graph action_expert has no {key}"):
             load_artifacts(copy)
 
+    @pytest.mark.slow
     def test_a_long_shape_is_cut_in_the_message(self, copy: Path) -> None:
         edit_manifest(copy, self.with_output([0] * 100))
         with pytest.raises(ArtifactError) as refusal:
@@ -212,17 +217,20 @@ class TestSession:
     def session(**changes: object) -> Edit:
         return lambda m: m["graphs"]["action_expert"]["session"].update(changes)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("threads", [None, 1, 256])
     def test_up_to_256_threads_are_taken(self, copy: Path, threads: int | None) -> None:
         edit_manifest(copy, self.session(threads=threads))
         assert load_artifacts(copy).graphs["action_expert"].session.threads == threads
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("threads", [0, -1, 257])
     def test_none_and_more_are_refused(self, copy: Path, threads: int) -> None:
         edit_manifest(copy, self.session(threads=threads))
         with pytest.raises(ArtifactError, match=f"session threads {threads}, expected 1 to 256"):
             load_artifacts(copy)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("key", "value"), [("provider", 1), ("options", []), ("threads", "2"), ("engine", 1), ("options", {"a": 1})]
     )
@@ -231,6 +239,7 @@ class TestSession:
         with pytest.raises(ArtifactError, match=f"graph action_expert: session {key} is of the wrong type"):
             load_artifacts(copy)
 
+    @pytest.mark.slow
     def test_an_unknown_key_is_refused_with_those_that_there_are(self, copy: Path) -> None:
         edit_manifest(copy, self.session(more=1))
         with pytest.raises(ArtifactError, match="session must give provider, options, threads, engine"):
@@ -238,23 +247,27 @@ class TestSession:
 
 
 class TestFilesAndGraphs:
+    @pytest.mark.slow
     def test_a_file_that_is_not_listed_is_named(self, copy: Path) -> None:
         (copy / "b.txt").touch()
         (copy / "a.txt").touch()
         with pytest.raises(ArtifactError, match=r"a\.txt: not listed in the manifest; export again"):
             load_artifacts(copy)
 
+    @pytest.mark.slow
     def test_an_unknown_graph_is_named(self, copy: Path) -> None:
         edit_manifest(copy, lambda m: m["graphs"].update(another=m["graphs"]["action_expert"]))
         with pytest.raises(ArtifactError, match="graph 'another' is unknown to the runner"):
             load_artifacts(copy)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("graph", ["vision_encoder", "semantic_context", "action_expert"])
     def test_a_missing_graph_is_named(self, copy: Path, graph: str) -> None:
         edit_manifest(copy, lambda m: m["graphs"].pop(graph))
         with pytest.raises(ArtifactError, match=f"graph {graph} is missing"):
             load_artifacts(copy)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("changes", "named"),
         [
@@ -281,12 +294,14 @@ class TestFilesAndGraphs:
         with pytest.raises(ArtifactError, match=f"{section} must be an object"):
             load_artifacts(copy)
 
+    @pytest.mark.slow
     def test_a_directory_without_a_tokenizer_is_refused(self, copy: Path) -> None:
         (copy / "tokenizer.json").unlink()
         edit_manifest(copy, lambda m: m["files"].pop("tokenizer.json"))
         with pytest.raises(ArtifactError, match=r"tokenizer\.json is missing from the files"):
             load_artifacts(copy)
 
+    @pytest.mark.slow
     def test_a_tokenizer_with_more_words_than_the_network_is_refused(self, copy: Path) -> None:
         edit_manifest(copy, lambda m: m["model"]["config"]["language"].update(vocab=100))
         with pytest.raises(ArtifactError, match="the network's vocabulary ends at 99"):
@@ -295,6 +310,7 @@ class TestFilesAndGraphs:
     def test_what_is_loaded_has_its_target_and_answers_and_without_trust_no_release(self, artifacts: Artifacts) -> None:
         assert artifacts.target == "cpu" and artifacts.release is None and artifacts.known_answers is not None
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(("value", "trained"), [(True, True), (False, False), (1, False), ("yes", False)])
     def test_only_true_means_trained(self, copy: Path, value: object, trained: bool) -> None:
         edit_manifest(copy, lambda m: m["model"].update(trained=value))

@@ -32,12 +32,14 @@ def with_delay(planned_s: object, asked_s: object) -> Edit:
     return edit
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay_s", [0.1, 10, 60.0])
 def test_a_semantic_state_may_become_a_minute_old(copy: Path, delay_s: float) -> None:
     edit_manifest(copy, with_delay(delay_s, delay_s))
     load_artifacts(copy)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay_s", [0, -1, 0.05, 60.5, 600, 1e6, True, "10"])
 def test_an_age_of_a_semantic_state_at_which_no_robot_may_drive_is_refused(copy: Path, delay_s: object) -> None:
     edit_manifest(copy, with_delay(delay_s, delay_s))
@@ -58,6 +60,7 @@ def test_a_power_budget_that_no_device_has_is_refused(copy: Path, budget_w: obje
         load_artifacts(copy)
 
 
+@pytest.mark.slow
 def test_a_manifest_without_a_plan_and_a_target_is_taken(copy: Path) -> None:
     edit_manifest(copy, lambda m: m.update(plan={}, provenance={}))
     load_artifacts(copy)

@@ -53,6 +53,7 @@ def change(directory: Path, **values: Any) -> None:
     path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
 
 
+@pytest.mark.slow
 def test_signed_artifacts_are_accepted_and_name_their_release(signed: Path, trust: Trust) -> None:
     assert load_artifacts(signed, trust).release == 7
 
@@ -108,6 +109,7 @@ def test_a_signature_of_another_directory_is_refused(copy: Path, keys: Path, tru
         load_artifacts(copy, trust)
 
 
+@pytest.mark.slow
 def test_an_older_release_than_the_last_accepted_one_is_refused(copy: Path, keys: Path, trust: Trust) -> None:
     for release in (7, 9, 9):
         sign(copy, keys / "ours", release)
@@ -117,6 +119,7 @@ def test_an_older_release_than_the_last_accepted_one_is_refused(copy: Path, keys
         load_artifacts(copy, trust)
 
 
+@pytest.mark.slow
 def test_a_release_that_is_refused_for_another_reason_is_not_remembered(copy: Path, keys: Path, trust: Trust) -> None:
     sign(copy, keys / "ours", 9)
     whole = (copy / "tokenizer.json").read_bytes()
@@ -128,6 +131,7 @@ def test_a_release_that_is_refused_for_another_reason_is_not_remembered(copy: Pa
     assert load_artifacts(copy, trust).release == 8
 
 
+@pytest.mark.slow
 def test_a_robot_that_comes_to_trust_a_new_key_starts_a_new_row(copy: Path, keys: Path, tmp_path: Path) -> None:
     counter = tmp_path / "release.json"
     sign(copy, keys / "ours", 9)
@@ -150,6 +154,7 @@ def test_a_counter_that_cannot_be_kept_is_a_refusal(signed: Path, keys: Path, tm
         load_artifacts(signed, Trust(keys / "ours.pub", tmp_path / "state" / "release.json"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", ["fsync", "replace"])
 def test_a_power_cut_while_the_counter_is_written_leaves_the_old_one(
     signed: Path, keys: Path, trust: Trust, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
@@ -202,6 +207,7 @@ def test_damaged_artifacts_are_not_signed(copy: Path, keys: Path) -> None:
     assert not (copy / "manifest.sig").exists()
 
 
+@pytest.mark.slow
 def test_the_command_makes_a_key_signs_and_verifies(
     copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

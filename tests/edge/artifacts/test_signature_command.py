@@ -107,6 +107,7 @@ def test_the_help_shows_what_each_argument_takes(command: str, shown: list[str],
     assert all(one in text for one in shown), text
 
 
+@pytest.mark.slow
 def test_the_result_names_key_and_time_and_the_operator_reads_the_same(
     copy: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

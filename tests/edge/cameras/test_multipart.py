@@ -34,6 +34,7 @@ def test_pictures_are_the_same_however_the_bytes_are_cut(sizes: list[int], lengt
     assert [each.jpeg for each in feed(stream, sizes)] == [JPEG_A, JPEG_B]
 
 
+@pytest.mark.slow
 @given(st.binary(max_size=400), st.booleans())
 def test_any_bytes_give_pictures_or_a_stream_error_and_nothing_else(data: bytes, head: bool) -> None:
     with contextlib.suppress(StreamError):

@@ -93,6 +93,7 @@ def reader(fifo: Path) -> Iterator[list[bytes]]:
     thread.join(10)
 
 
+@pytest.mark.slow
 @AS_ROOT
 def test_a_device_node_stays_a_device_node(command: Callable[[Path], tuple[int, int]], tmp_path: Path) -> None:
     device = node(tmp_path / "null.json", 3)
@@ -101,6 +102,7 @@ def test_a_device_node_stays_a_device_node(command: Callable[[Path], tuple[int, 
     assert stat.S_ISCHR(device.lstat().st_mode)
 
 
+@pytest.mark.slow
 @AS_ROOT
 def test_a_full_device_is_one_line_and_exit_code_1(
     command: Callable[[Path], tuple[int, int]], tmp_path: Path, capfd: pytest.CaptureFixture[str]
@@ -113,6 +115,7 @@ def test_a_full_device_is_one_line_and_exit_code_1(
     assert stat.S_ISCHR(device.lstat().st_mode)
 
 
+@pytest.mark.slow
 def test_a_fifo_gets_the_result_and_stays(command: Callable[[Path], tuple[int, int]], tmp_path: Path) -> None:
     fifo = tmp_path / "fifo.json"
     os.mkfifo(fifo)
@@ -123,6 +126,7 @@ def test_a_fifo_gets_the_result_and_stays(command: Callable[[Path], tuple[int, i
     assert stat.S_ISFIFO(fifo.lstat().st_mode)
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(60)
 def test_a_fifo_without_a_reader_is_one_line(
     command: Callable[[Path], tuple[int, int]], tmp_path: Path, capfd: pytest.CaptureFixture[str]
@@ -135,6 +139,7 @@ def test_a_fifo_without_a_reader_is_one_line(
     assert stat.S_ISFIFO(fifo.lstat().st_mode)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exists", [True, False], ids=["to a file", "to a new name"])
 def test_a_link_stays_and_leads_to_the_result(
     command: Callable[[Path], tuple[int, int]], tmp_path: Path, exists: bool

@@ -332,11 +332,13 @@ def homes(draw: st.DrawFn) -> Home:
     return Home(Layout(Path("/x")), tuple(releases), tuple(sorted(unfinished)), draw(st.sampled_from(numbers)))
 
 
+@pytest.mark.slow
 @given(homes())
 def test_a_new_number_is_above_every_other(home: Home) -> None:
     assert home.next_number() > max([*(release.number for release in home.releases), *home.unfinished])
 
 
+@pytest.mark.slow
 @given(homes(), st.none() | st.integers(1, 30), st.integers(1, 5))
 def test_pruning_never_removes_the_current_or_the_previous_release(home: Home, previous: int | None, keep: int) -> None:
     assert home.current is not None
@@ -344,6 +346,7 @@ def test_pruning_never_removes_the_current_or_the_previous_release(home: Home, p
     assert home.current not in removed and previous not in removed
 
 
+@pytest.mark.slow
 @given(homes(), st.none() | st.integers(1, 30), st.integers(1, 5))
 def test_pruning_leaves_at_most_as_many_as_asked_for(home: Home, previous: int | None, keep: int) -> None:
     assert home.current is not None

@@ -236,6 +236,7 @@ def by_name(result: dict[str, Any]) -> dict[str, dict[str, str]]:
     return {check["name"]: check for check in result["checks"]}
 
 
+@pytest.mark.slow
 def test_real_artifacts_on_the_machine_that_they_are_for(artifacts_dir: Path, tmp_path: Path) -> None:
     code, result = run(
         tmp_path, "--artifacts", str(artifacts_dir), "--target", "cpu", "--ticks", "3", "--logs", str(tmp_path)
@@ -255,6 +256,7 @@ def test_a_missing_option_is_shown_as_skipped(tmp_path: Path) -> None:
         assert checks[name]["found"].startswith("skipped: ")
 
 
+@pytest.mark.slow
 def test_artifacts_of_another_target_fail(artifacts_dir: Path, tmp_path: Path) -> None:
     code, result = run(tmp_path, "--artifacts", str(artifacts_dir), "--target", "orin", "--ticks", "0")
     assert (code, by_name(result)["artifacts"]["level"]) == (EXIT_CHECK_FAILED, "fail")
@@ -291,6 +293,7 @@ def test_a_graphics_cards_memory_is_told_apart_from_the_machines() -> None:
         assert facts.own_memory is own
 
 
+@pytest.mark.slow
 def test_missing_engines_fail_with_the_command_that_builds_them(artifacts_dir: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(artifacts_dir, tmp_path / "orin"))
     manifest = json.loads((copy / "manifest.json").read_text())

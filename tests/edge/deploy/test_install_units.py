@@ -93,6 +93,7 @@ def test_it_writes_both_units_and_the_user_and_prints_the_start_command(units: U
     assert "drives after `edge-bridge arm` only" in text and "--arm-at-start" not in text
 
 
+@pytest.mark.slow
 def test_services_of_a_board_follow_its_current_release(units: Units, artifacts_dir: Path, tmp_path: Path) -> None:
     home = tmp_path / "home"
     release = home / "releases/3"
@@ -139,6 +140,7 @@ def test_useless_consent_is_reported(units: Units, capsys: pytest.CaptureFixture
     assert "--arm-at-start changes nothing" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_names_of_users_and_group_can_be_given(units: Units, tmp_path: Path) -> None:
     names = ("--bridge-user", "b", "--runner-user", "r", "--operator-group", "o")
     assert units(*names)[0] == EXIT_DONE
@@ -156,6 +158,7 @@ def test_without_nft_the_rules_are_written_and_the_missing_package_is_named(
     assert "apt install nftables" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_firewall_that_accepts_a_whole_network_is_reported(
     units: Units, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -184,6 +187,7 @@ def test_for_the_system_they_go_where_systemd_reads_them(units: Units, host: Hos
     assert (host.root / "etc/tic-vla-edge" / FIREWALL_FILE).is_file()
 
 
+@pytest.mark.slow
 def test_the_runners_memory_is_the_targets_budget(units: Units, tmp_path: Path) -> None:
     units()
     device = load_target("cpu", "nano").device
@@ -197,12 +201,14 @@ def test_the_instruction_can_come_from_a_file(units: Units, tmp_path: Path) -> N
     assert '"--instruction=walk to the door"' in (tmp_path / "units" / RUNNER_UNIT).read_text()
 
 
+@pytest.mark.slow
 def test_a_second_run_writes_nothing(units: Units) -> None:
     units()
     code, result = units()
     assert (code, result and result["written"]) == (EXIT_DONE, [])
 
 
+@pytest.mark.slow
 def test_a_file_that_differs_is_replaced_only_by_force(
     units: Units, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -238,6 +244,7 @@ def test_artifacts_of_another_target_are_refused(units: Units, capsys: pytest.Ca
     assert "expected orin" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_artifacts_that_the_trusted_key_has_not_signed_are_refused(units: Units, tmp_path: Path) -> None:
     keygen(tmp_path / "release.pem")
     assert units("--trust", str(tmp_path / "release.pem.pub"))[0] == EXIT_REFUSED
@@ -278,6 +285,7 @@ def jetson(host: Host) -> Host:
     return host
 
 
+@pytest.mark.slow
 def test_the_jetsons_runner_gets_its_nodes_and_its_engines(
     units: Units, host: Host, orin_dir: Path, tmp_path: Path
 ) -> None:
@@ -294,6 +302,7 @@ def test_the_jetsons_runner_gets_its_nodes_and_its_engines(
     assert f'"--engines" "{tmp_path}/orin.engines"' in text
 
 
+@pytest.mark.slow
 def test_a_runner_without_its_device_is_written_but_not_installed(
     units: Units, orin_dir: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

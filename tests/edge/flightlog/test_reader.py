@@ -52,6 +52,7 @@ def whole_file(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return path.read_bytes()
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(part=st.floats(0.0, 1.0))
 def test_a_file_cut_anywhere_yields_a_prefix_and_never_raises(part: float, whole_file: bytes, tmp_path: Path) -> None:

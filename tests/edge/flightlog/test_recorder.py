@@ -274,6 +274,7 @@ def test_a_part_that_grows_slowly_is_ended_after_five_minutes(tmp_path: Path, mo
     assert ticks(path) == [0, 1]
 
 
+@pytest.mark.slow
 def test_beyond_the_limit_the_oldest_part_but_the_first_is_given_up(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     limits = RecorderLimits(part_bytes=400_000, total_bytes=2_000_000)

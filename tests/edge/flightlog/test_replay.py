@@ -356,6 +356,7 @@ def test_the_table_shows_the_same_as_the_json(log: Log, capsys: pytest.CaptureFi
     assert "4 run again, 4 texts equal" in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [

@@ -173,6 +173,7 @@ def test_every_shape_of_the_profiles_is_run_at_build_time(built: FakeTensorRt, o
     assert fixed == {(1, 128, 128, 3)}
 
 
+@pytest.mark.slow
 def test_a_profile_shorter_than_the_models_context_is_refused(directory: Path, engines: Path) -> None:
     edit_manifest(directory, lambda m: m["runtime"].update(max_context=513))
     edit_manifest(directory, lambda m: m["model"].get("config", {}).pop("language", None))
@@ -286,6 +287,7 @@ def on_the_processor(graphs: dict[str, Any]) -> None:
     graphs["vision_encoder"]["session"].update(provider="CPUExecutionProvider", options={})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fake", "change", "message"),
     [
@@ -311,6 +313,7 @@ def test_an_engine_that_cannot_be_kept_is_refused(
     assert not list(engines.glob("*.partial"))
 
 
+@pytest.mark.slow
 def test_the_command_builds_reports_and_names_every_graph_before_its_build(
     directory: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -325,12 +328,14 @@ def test_the_command_builds_reports_and_names_every_graph_before_its_build(
     load_artifacts(directory)
 
 
+@pytest.mark.slow
 def test_the_command_does_not_write_into_the_sealed_directory(directory: Path) -> None:
     arguments = ["engines", "--artifacts", str(directory), "--engines", str(directory / "engines")]
     assert main(arguments, FakeTensorRt().machine()) == EXIT_BAD_INPUT
     load_artifacts(directory)
 
 
+@pytest.mark.slow
 def test_the_command_refuses_a_machine_without_the_provider(
     directory: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -346,6 +351,7 @@ def test_the_command_refuses_artifacts_that_do_not_verify(directory: Path) -> No
     assert main(["engines", "--artifacts", str(directory)], FakeTensorRt().machine()) == EXIT_REFUSED
 
 
+@pytest.mark.slow
 def test_a_runner_without_the_engines_refuses_before_anything_moves(
     directory: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

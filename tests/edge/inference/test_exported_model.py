@@ -24,6 +24,7 @@ from export.model.network import build
 NANO = PRESETS["nano"]
 
 
+@pytest.mark.slow
 def test_the_exported_model_generates_the_same_text_as_pytorch(artifacts: Artifacts) -> None:
     """Greedy decoding over the runner's own prompt, segments and cache, against one uncached PyTorch pass a token."""
     model = build(NANO, 0)

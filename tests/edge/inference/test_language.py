@@ -197,6 +197,7 @@ def test_an_interrupt_from_another_thread_ends_a_call_that_is_under_way(artifact
         language.begin(cancelled, interrupt=interrupt).finish(segments, max_new_tokens=5)
 
 
+@pytest.mark.slow
 def test_leftovers_of_an_earlier_or_interrupted_generation_are_not_read(artifacts: Artifacts, expected: tuple) -> None:
     language = model(artifacts, 64)
     interrupt = Interrupt()
@@ -213,6 +214,7 @@ def test_leftovers_of_an_earlier_or_interrupted_generation_are_not_read(artifact
     assert generation.token_ids == expected[1]
 
 
+@pytest.mark.slow
 @settings(max_examples=10)
 @given(st.integers(1, 30))
 def test_no_more_tokens_than_allowed(artifacts: Artifacts, allowed: int) -> None:

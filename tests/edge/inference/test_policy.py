@@ -63,6 +63,7 @@ class MallInfo(ctypes.Structure):
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_ticks_keep_no_memory_and_ask_the_system_for_none(policy: Policy, artifacts: Artifacts) -> None:
     libc = ctypes.CDLL(None)
     if not hasattr(libc, "mallinfo2"):

@@ -155,6 +155,7 @@ def test_artifacts_that_compute_otherwise_are_refused(copy: Path, damage: Damage
         open_proven(artifacts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", [1, 2])
 def test_the_exported_answers_are_found_again(artifacts: Artifacts, threads: int) -> None:
     policy, language = Policy(artifacts, threads=threads), LanguageModel(artifacts, threads=threads)

@@ -201,6 +201,7 @@ def scripted(artifacts: Artifacts) -> Models:
     return open_models(artifacts)
 
 
+@pytest.mark.slow
 @settings(max_examples=30)
 @given(TEXTS, TEXTS, CONTEXTS, st.integers(1, 60))
 def test_a_constrained_text_is_the_same_with_any_guesses(
@@ -328,6 +329,7 @@ def test_a_graph_that_rounds_rows_together_is_never_given_guesses(dynamic: Artif
     assert len(generated(model, 0, most=5).call_tokens) >= 5
 
 
+@pytest.mark.slow
 def test_an_interrupted_text_leaves_no_trace_in_the_next_one(models: Models) -> None:
     plain, guessing = models
     guessing.speculator = _even(guessing)
@@ -339,6 +341,7 @@ def test_an_interrupted_text_leaves_no_trace_in_the_next_one(models: Models) -> 
     assert_equal(generated(guessing, 3), generated(plain, 3))
 
 
+@pytest.mark.slow
 def test_a_full_context_ends_the_text_at_the_same_token(models: Models) -> None:
     plain, guessing = models
     guessing.speculator = _even(guessing)

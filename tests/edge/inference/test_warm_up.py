@@ -45,6 +45,7 @@ def run_contexts(opened: warm_up.Opened, lengths: Sequence[int]) -> None:
         opened.policy.act(tokens, (0.0, 0.0, 0.0), 0.0, here, semantic)
 
 
+@pytest.mark.slow
 def test_after_the_warm_up_no_length_of_the_semantic_state_takes_more_memory(artifacts_dir: Path) -> None:
     opened = warm_up.open_proven(load_artifacts(artifacts_dir))
     warm_up.warm_up(opened.policy, opened.language, Speculation.OFF)

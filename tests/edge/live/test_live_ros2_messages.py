@@ -119,6 +119,7 @@ def test_power_and_battery_are_in_the_diagnostics(messages: Ros2Messages) -> Non
     assert status(messages, "battery").values[0].value == "80"
 
 
+@pytest.mark.slow
 @given(
     st.sampled_from(["/run", "/tick", "/semantic", "/odometry", "/power", "/battery", "/fault", "/x"]),
     st.dictionaries(

@@ -126,6 +126,7 @@ def test_a_new_client_gets_the_events_and_the_newest_of_the_rest() -> None:
     assert sum(message.topic == "/fault" for message in found) == 24
 
 
+@pytest.mark.slow
 @given(st.sampled_from(["/run", "/tick", "/semantic", "/fault", "/odometry", "/power", "/x"]), JSON_VALUES)
 def test_no_record_ends_the_view(topic: str, content: Any) -> None:
     state, metrics = ready(), Metrics()

@@ -86,6 +86,7 @@ def test_a_point_behind_and_a_plan_that_stays_in_place_only_turn() -> None:
 finite = st.floats(-1e6, 1e6, width=32)
 
 
+@pytest.mark.slow
 @settings(max_examples=2 * settings.default.max_examples)
 @given(
     st.lists(st.tuples(finite, finite, finite), min_size=30, max_size=30), st.lists(st.integers(0, 10**9), max_size=5)
@@ -101,6 +102,7 @@ def test_no_plan_can_leave_the_limits(points: list[tuple[float, float, float]], 
         assert command.vy_mps == 0.0
 
 
+@pytest.mark.slow
 @settings(max_examples=5 * settings.default.max_examples)
 @given(st.floats(0.0, 1e6), st.floats(-1e6, 1e6), st.floats(0.01, 3.8), st.floats(0.01, 4.0), st.floats(1e-6, 1.0))
 @example(speed=3.2254540894089683, yaw_rate=0.0, vx_max_mps=0.8, wz_max_radps=1.0, speed_scale=1.0)

@@ -79,5 +79,6 @@ def test_a_guided_policy_has_no_plan_without_waypoints(guided: Artifacts) -> Non
         policy.act(tokens, (0.0, 0.0, 0.0), 1.0, SE2(0.0, 0.0, 0.0), state(None, policy))
 
 
+@pytest.mark.slow
 def test_the_runner_warms_a_guided_policy_up(guided: Artifacts) -> None:
     warm_up(Policy(guided, threads=1), LanguageModel(guided, threads=1), Speculation.ON)

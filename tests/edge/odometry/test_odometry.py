@@ -96,6 +96,7 @@ def test_a_camera_that_sees_nonsense_is_not_believed() -> None:
     assert math.hypot(*offset_error(path, estimator, len(path.true) - 1, 250)[:2]) < 0.03
 
 
+@pytest.mark.slow
 def test_without_a_gyro_the_camera_holds_the_heading() -> None:
     path = drive(20, yaw_drift_rad_per_m=math.radians(5))
     path = replace(path, reports=tuple(replace(r, gyro_wz_radps=None) for r in path.reports))
@@ -239,6 +240,7 @@ reports = st.builds(
 )
 
 
+@pytest.mark.slow
 @given(st.lists(reports, max_size=12))
 def test_any_robot_report_leaves_the_pose_finite_and_raises_nothing(garbage: list[OdometryInputs]) -> None:
     path, estimator = drive(0.2), DriftEstimator()

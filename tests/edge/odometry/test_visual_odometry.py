@@ -49,6 +49,7 @@ def true_motion(poses: list[SE2], answers: list[VisualMotion]) -> SE2:
     return poses[answers[0].start_ns // FRAME_NS].inverse() @ poses[answers[-1].end_ns // FRAME_NS]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "step",
     [SE2(0.05, 0.0, 0.0), SE2(0.04, 0.0, 0.05), SE2(0.03, 0.02, -0.04), SE2(-0.03, 0.0, 0.0), SE2(0.0, 0.0, 0.06)],
@@ -64,6 +65,7 @@ def test_a_motion_over_the_floor_is_measured_to_a_percent(step: SE2) -> None:
     assert found.theta_rad == pytest.approx(true.theta_rad, abs=0.006)
 
 
+@pytest.mark.slow
 def test_answers_follow_each_other_without_a_gap() -> None:
     answers = watch(picture(TEXTURE, pose) for pose in along(SE2(0.06, 0.0, 0.0), 20))
     assert len(answers) >= 3
@@ -170,6 +172,7 @@ def test_a_large_jpeg_is_shrunk_while_it_is_decoded(width: int, expected: int) -
     assert grey.shape[1] == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("height_m", "hfov_deg", "pitch_deg"), [(0.2, 90, 5), (1.0, 70, 15), (1.5, 90, 5)], ids=["low", "high", "higher"]
 )

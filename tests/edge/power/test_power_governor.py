@@ -94,6 +94,7 @@ def test_each_load_keeps_the_budget_after_half_a_minute_and_every_tick(load: str
     assert row["ok"], row
 
 
+@pytest.mark.slow
 def test_the_same_device_without_a_governor_does_not_keep_the_budget() -> None:
     row = judge("plan", simulate("plan", seconds=60, governed=False), orin()[1].budget_w or math.nan)
     assert not row["ok"]
@@ -107,6 +108,7 @@ def test_below_the_budget_and_without_one_reasoning_is_not_limited(budget_w: flo
     assert set(run.levels) == {"full"}
 
 
+@pytest.mark.slow
 def test_a_budget_that_a_pause_can_keep_costs_no_token() -> None:
     run = bench(20.0, max_delay_s=20.0)
     run.step(120)
@@ -115,6 +117,7 @@ def test_a_budget_that_a_pause_can_keep_costs_no_token() -> None:
     assert run.generations >= 14
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rise_w", [5.0, 20.0])
 def test_a_plan_that_is_wrong_by_a_factor_of_two_settles_all_the_same(rise_w: float) -> None:
     run = bench(20.0)
@@ -123,6 +126,7 @@ def test_a_plan_that_is_wrong_by_a_factor_of_two_settles_all_the_same(rise_w: fl
     assert run.worst_window_w(30) <= 20.0 * 1.02
 
 
+@pytest.mark.slow
 def test_without_a_plan_it_learns_what_it_needs() -> None:
     run = bench(20.0, model=None)
     run.step(120)
@@ -161,6 +165,7 @@ def test_power_drawn_without_reasoning_cannot_be_shed_and_is_reported() -> None:
     assert any("above the budget without any reasoning" in line for line in run.says)
 
 
+@pytest.mark.slow
 def test_reasoning_comes_back_when_there_is_room_again() -> None:
     run = bench(20.0)
     run.base_w = 22.0
@@ -171,6 +176,7 @@ def test_reasoning_comes_back_when_there_is_room_again() -> None:
     assert run.outputs.level == "full"
 
 
+@pytest.mark.slow
 def test_a_load_at_the_edge_of_two_steps_does_not_make_it_change_for_ever() -> None:
     run = bench(20.0)
     run.base_w = 17.0
@@ -178,6 +184,7 @@ def test_a_load_at_the_edge_of_two_steps_does_not_make_it_change_for_ever() -> N
     assert sum(a != b for a, b in itertools.pairwise(run.levels[600:])) <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("power_w", [None, math.nan, math.inf, -3.0, 1e9])
 def test_a_meter_without_valid_readings_is_replaced_by_the_model_and_reported(power_w: float | None) -> None:
     run = bench(20.0)
@@ -197,6 +204,7 @@ def test_single_lost_samples_change_nothing() -> None:
     assert run.worst_window_w(30) <= 20.0 * 1.02
 
 
+@pytest.mark.slow
 def test_a_long_gap_between_steps_neither_raises_nor_opens_the_budget() -> None:
     run = bench(20.0)
     run.step(60)
@@ -256,6 +264,7 @@ def test_a_low_battery_lowers_the_budget_and_an_empty_one_ends_reasoning() -> No
     assert empty.findings == ("battery-empty", "battery-low") and not empty.budget.allowed
 
 
+@pytest.mark.slow
 def test_a_low_battery_stays_low_without_reports_and_clears_with_hysteresis() -> None:
     run = bench(25.0)
     run.step(1, battery_percent=15)
@@ -309,6 +318,7 @@ def test_the_average_of_a_window(
     assert history.average_w(at_s * SECOND, window_s) == pytest.approx(average_w)
 
 
+@pytest.mark.slow
 @given(
     st.lists(st.tuples(st.integers(1, 3 * SECOND), st.floats(0.0, 100.0)), min_size=1, max_size=40),
     st.integers(0, 12 * SECOND),
@@ -323,6 +333,7 @@ def test_energy_since_an_instant_is_the_energy_of_that_interval(steps: list[tupl
     assert history.energy_since(now_ns)(now_ns - back_ns) == pytest.approx(expected, rel=1e-6, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("keeper", "bound_bytes"),
     [
@@ -357,6 +368,7 @@ def test_the_percentile_is_not_exceeded_for_that_share_of_the_time() -> None:
     assert statistics.percentile_w(0.99) == pytest.approx(30.0, abs=0.051)
 
 
+@pytest.mark.slow
 def test_the_plan_of_the_orin_gives_its_meter_its_rail_and_its_budget() -> None:
     power = orin()[1]
     assert (power.meter, power.rail, power.budget_w) == ("ina3221", "VDD_IN", 25.0)

@@ -134,12 +134,14 @@ def stamps(steps: list[Step], kind: type[Event]) -> list[int]:  # type: ignore[v
     return [step.now_ns for step in steps if isinstance(step.inputs.event, kind)]
 
 
+@pytest.mark.slow
 @given(MODES, st.lists(DRAWS, max_size=60))
 def test_nothing_starts_while_the_budget_forbids_it_or_the_run_ends(mode: Mode, draws: list[Draw]) -> None:
     for step in starts(run(mode, draws)[1]):
         assert step.inputs.budget.allowed and not step.inputs.stopping
 
 
+@pytest.mark.slow
 @given(MODES, st.lists(DRAWS, max_size=60))
 def test_no_frame_is_the_newest_of_two_generations(mode: Mode, draws: list[Draw]) -> None:
     used_ns = -1
@@ -152,6 +154,7 @@ def test_no_frame_is_the_newest_of_two_generations(mode: Mode, draws: list[Draw]
             used_ns = step.inputs.event.newest_ns
 
 
+@pytest.mark.slow
 @given(MODES, st.lists(DRAWS, max_size=60))
 def test_a_failed_generation_is_followed_by_a_pause(mode: Mode, draws: list[Draw]) -> None:
     failed_ns = -math.inf
@@ -162,6 +165,7 @@ def test_a_failed_generation_is_followed_by_a_pause(mode: Mode, draws: list[Draw
             assert step.now_ns - failed_ns >= RETRY_S * 1e9
 
 
+@pytest.mark.slow
 @given(MODES, st.lists(DRAWS, max_size=60))
 def test_the_budgets_pause_follows_a_finished_generation(mode: Mode, draws: list[Draw]) -> None:
     finished_ns = -math.inf
@@ -183,6 +187,7 @@ def test_reasoning_ends_exactly_when_so_many_generations_fail_within_the_window(
     assert (bool(steps) and steps[-1].failure is not None) == crowded
 
 
+@pytest.mark.slow
 @given(MODES, st.lists(st.one_of(FAILING, DRAWS), max_size=60))
 def test_nothing_starts_after_reasoning_has_ended(mode: Mode, draws: list[Draw]) -> None:
     ended = False
@@ -192,6 +197,7 @@ def test_nothing_starts_after_reasoning_has_ended(mode: Mode, draws: list[Draw])
         assert ended == (step.failure is not None), "the latch is never released"
 
 
+@pytest.mark.slow
 @given(MODES, st.lists(DRAWS, max_size=60), st.booleans())
 def test_a_result_is_published_at_its_release_time_and_never_for_an_older_request(
     mode: Mode, draws: list[Draw], needs_waypoints: bool
@@ -211,6 +217,7 @@ def test_a_result_is_published_at_its_release_time_and_never_for_an_older_reques
             started, finished = step, None
 
 
+@pytest.mark.slow
 @given(MODES, st.lists(DRAWS, max_size=60))
 def test_a_running_generation_is_interrupted_exactly_when_something_replaces_or_forbids_it(
     mode: Mode, draws: list[Draw]
@@ -225,6 +232,7 @@ def test_a_running_generation_is_interrupted_exactly_when_something_replaces_or_
             assert (step.outputs.action is Action.INTERRUPT) == replaced
 
 
+@pytest.mark.slow
 @given(MODES, st.lists(DRAWS, max_size=60))
 def test_the_text_is_limited_by_the_mode_and_the_budget_at_its_start(mode: Mode, draws: list[Draw]) -> None:
     for step in starts(run(mode, draws)[1]):
@@ -233,6 +241,7 @@ def test_the_text_is_limited_by_the_mode_and_the_budget_at_its_start(mode: Mode,
         assert step.outputs.max_new_tokens == expected
 
 
+@pytest.mark.slow
 @given(MODES, st.lists(DRAWS, max_size=60), st.booleans())
 def test_every_generation_has_one_outcome(mode: Mode, draws: list[Draw], needs_waypoints: bool) -> None:
     draws = [Draw(**{**vars(draw), "stopping": False}) for draw in draws]
@@ -253,6 +262,7 @@ def test_every_generation_has_one_outcome(mode: Mode, draws: list[Draw], needs_w
     assert cycle.cancelled == len(stamps(steps, Cancelled)) + cancelled_held
 
 
+@pytest.mark.slow
 @given(MODES, st.lists(DRAWS, max_size=60))
 def test_only_sync_mode_limits_driving_and_each_result_extends_it_by_half_a_second(
     mode: Mode, draws: list[Draw]
@@ -271,6 +281,7 @@ def test_in_sync_mode_a_generation_starts_only_after_the_halt(draws: list[Draw])
         assert step.inputs.frames[-1][0] >= step.outputs.drive_until_ns
 
 
+@pytest.mark.slow
 @given(MODES, st.lists(DRAWS, max_size=60))
 def test_a_text_that_was_cut_short_is_not_counted_as_invalid(mode: Mode, draws: list[Draw]) -> None:
     cycle, steps = run(mode, draws)

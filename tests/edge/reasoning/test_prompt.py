@@ -93,6 +93,7 @@ def test_a_plan_counts_as_many_text_tokens_as_a_usual_prompt_has(builder: Prompt
     assert length(prompt) - 4 * 16 == TEXT_TOKENS[False]
 
 
+@pytest.mark.slow
 @given(st.lists(st.tuples(tenths, tenths), max_size=8), st.integers(1, 99), st.integers(0, 99))
 def test_no_way_and_no_progress_is_longer_than_the_longest(points: list[Point], step: int, passed: int) -> None:
     tail = BUILDER.tail(tuple(points), Progress(step, 99, passed))

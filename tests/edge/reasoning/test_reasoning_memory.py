@@ -115,6 +115,7 @@ def threaded(ticks: int, every: int, of: Callable[[FakeLanguage], FakeLanguage] 
     return bench.language
 
 
+@pytest.mark.slow
 def test_both_loops_give_the_model_the_same_prompts_and_rules() -> None:
     """Here the runner's text is there at once, the benchmark's after 2 s: both before the next generation begins."""
     virtual, thread = lockstep(801, 2.0), threaded(800, 20)

@@ -294,6 +294,7 @@ ORDERS = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_thousand_texts_leave_every_limit_as_it_is(bench: Bench) -> None:
     def bits() -> list[bytes]:
         return [struct.pack("<d", getattr(bench.limits, field.name)) for field in fields(bench.limits)]

@@ -193,6 +193,7 @@ class Runner:
 
 
 class TestRunner:
+    @pytest.mark.slow
     def test_it_waits_ten_minutes_for_an_operator_requests_once_a_second_and_reports_once(self) -> None:
         runner = Runner()
         runner.at_ms[600_000] = runner.permit
@@ -232,6 +233,7 @@ class TestRunner:
         runner.run()
         assert runner.now_ms >= 20_000
 
+    @pytest.mark.slow
     def test_a_robot_that_does_not_stand_up_in_time_is_a_refusal_after_any_wait(self) -> None:
         runner = Runner(bench_of(mode=ids.MODE_LIE_DOWN))
         runner.at_ms[60_000] = runner.permit
@@ -311,6 +313,7 @@ class TestInTheWay:
         assert runner.bench.status.state == "armed"
         assert runner.waited[0] == f"{WAITING} (dark)"
 
+    @pytest.mark.slow
     def test_an_operators_arm_is_not_kept_until_it_goes(self) -> None:
         runner = Runner()
         runner.at_ms = {

@@ -175,6 +175,7 @@ def test_a_pose_that_stays_while_the_robot_is_told_to_walk_stops_it_for_a_second
     assert not rig.bench.loop.supervision.stop and rig.command[0] > 0.4
 
 
+@pytest.mark.slow
 def test_a_pose_that_stays_for_good_is_tried_twice_and_then_stops_the_run(rig: Rig) -> None:
     began_ns = rig.bench.now_ns
     rig.blocked = True
@@ -193,6 +194,7 @@ def test_a_pose_that_is_not_finite_stops_the_robot_within_its_bound(rig: Rig, fi
     assert rig.zero_after_ms(began_ns) <= FAULTS["odometry-not-finite"].bound_ms
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("delay_ms", "fault"), [(200, "odometry-late"), (300, "odometry-stale")])
 def test_reports_that_stay_late_limit_the_speed_for_as_long_as_they_do(rig: Rig, delay_ms: int, fault: str) -> None:
     stamped = rig.bench.now_ns

@@ -129,6 +129,7 @@ def test_of_a_hundred_texts_only_the_newest_is_checked_for_the_model(rig: Rig) -
     assert rig.checked == ["turn left 99"]
 
 
+@pytest.mark.slow
 def test_any_bytes_are_an_instruction_or_a_refusal(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     waiting: list[bytes] = []
     info = SimpleNamespace(valid_data=True)

@@ -102,6 +102,7 @@ def mutated(source: random.Random) -> str:
     return GOOD[:place] + chr(source.randrange(1, 0x2FF)) + GOOD[place + 1 :]
 
 
+@pytest.mark.slow
 def test_ten_thousand_texts_give_waypoints_of_the_grammar_or_nothing() -> None:
     source = random.Random(19)
     agreed = re.compile(r"waypoints:( \(-?[0-9]{1,2}\.[0-9]{1,2}, -?[0-9]{1,2}\.[0-9]{1,2}\)){3}")
@@ -202,6 +203,7 @@ TEXTS = st.builds(
 )
 
 
+@pytest.mark.slow
 @given(TEXTS)
 def test_parsing_is_the_inverse_of_formatting_for_any_parts(parts: ReasoningText) -> None:
     text = format_text(parts)

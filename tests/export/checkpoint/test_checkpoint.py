@@ -49,6 +49,7 @@ def test_a_vlm_directory_and_an_action_expert_make_one_network(vlm: Path, expert
     assert set(loaded.coverage.loaded) == set(ours)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("prefix", ["", "model.", "vlm.", "module."])
 @pytest.mark.parametrize("layout", VLM_LAYOUTS, ids=lambda layout: layout.name)
 def test_a_lightning_checkpoint_holds_everything_under_its_own_prefix(
@@ -133,6 +134,7 @@ def test_a_refusal_counts_and_names_every_kind_of_difference(original: dict[str,
     assert "1 tensor of another shape (mlp1.0.weight is [3], expected [128])" in line
 
 
+@pytest.mark.slow
 def test_part_of_a_stacked_matrix_is_missing_by_its_own_name(tmp_path: Path) -> None:
     hf_model().save_pretrained(tmp_path / "hf")
     tensors = load_file(tmp_path / "hf" / "model.safetensors")

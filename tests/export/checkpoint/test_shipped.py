@@ -44,6 +44,7 @@ def test_a_damaged_file_is_reported(folder: Path) -> None:
         shipped_weights(SMALL, folder)
 
 
+@pytest.mark.slow
 def test_an_export_takes_them_unless_a_seed_is_given(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("export.pipeline.job.shipped_weights", lambda config: shipped_weights(config, folder))
     shipped, random = WeightSource(SMALL, [], None).loaded, WeightSource(SMALL, [], 3).loaded

@@ -58,6 +58,7 @@ def test_the_shipped_set_has_three_walks_of_twenty_seconds(shipped: CalibrationS
         assert clip.assumed == ""
 
 
+@pytest.mark.slow
 def test_the_shipped_frames_are_what_the_simulator_shows(shipped: CalibrationSet) -> None:
     walk = WALKS[0]
     for shown, kept in zip(record(walk, duration_s=2.0), shipped.clips[0].frames[:3], strict=True):

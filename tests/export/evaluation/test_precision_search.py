@@ -86,6 +86,7 @@ def test_the_search_leaves_every_weight_as_it_was(model: TicVla, search: Search,
     assert not any(module._forward_hooks or module._forward_pre_hooks for module in model.modules())
 
 
+@pytest.mark.slow
 def test_an_interrupted_search_leaves_every_weight_as_it_was(model: TicVla) -> None:
     before, layers = weights_sha256(model), linear_layers(TINY, "language_model")
     model.language.layers[2].gate.register_forward_pre_hook(_interrupt)
@@ -153,6 +154,7 @@ def test_decoding_is_held_to_the_tensors_of_the_gate(reference: Reference) -> No
     assert found.output_error == pytest.approx(max(errors), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_prefill_chooses_no_token_and_decoding_does(reference: Reference) -> None:
     prefill = probe(reference, "language_model.prefill", Rounder(), activations=True)
     decode = probe(reference, "language_model.decode", Rounder(), activations=True)
@@ -201,6 +203,7 @@ def test_the_table_ranks_every_group_of_layers(search: Search) -> None:
     assert None not in loads and loads == sorted(loads, reverse=True)  # type: ignore[type-var]
 
 
+@pytest.mark.slow
 def test_a_single_candidate_is_measured_and_kept(search: Search) -> None:
     decision = search.choose("action_expert", ["int8"], LIMITS)
     assert decision.precision == Precision("int8") and len(decision.table) == 1

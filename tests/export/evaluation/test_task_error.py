@@ -203,6 +203,7 @@ def test_fewer_bits_mean_more_error(model: TicVla, few_reference: StageOutputs, 
     assert 0 < of("fp16") <= of("int8") <= of("int4-b32")
 
 
+@pytest.mark.slow
 def test_a_share_of_the_spread_shows_what_centimetres_hide(
     model: TicVla, few_reference: StageOutputs, few: SampleSet
 ) -> None:

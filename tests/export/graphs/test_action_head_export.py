@@ -165,6 +165,7 @@ def counted_flops(model: TicVla, context: int) -> int:
     return int(counter.get_total_flops())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("head", HEADS)
 def test_the_cost_counts_what_is_computed(head: str) -> None:
     """But for what the graph holds as constants: the first queries, and the noise levels of a diffusion."""

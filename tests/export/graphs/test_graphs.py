@@ -65,11 +65,13 @@ def check(model: TicVla, directory: Path, name: str, precision: Precision, form:
     return compare(name, references(model, name, 4), outputs).max_abs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ALL)
 def test_every_fused_graph_is_the_network(nano: TicVla, tmp_path: Path, name: str) -> None:
     assert check(nano, tmp_path, name, EXACT, "fused") < 5e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["vision_encoder", "semantic_context", "action_expert"])
 def test_every_plain_graph_is_the_network(nano: TicVla, tmp_path: Path, name: str) -> None:
     assert check(nano, tmp_path, name, EXACT, "plain") < 5e-5
@@ -80,6 +82,7 @@ def test_the_papers_patch_embedding_and_pixel_shuffle_fold_exactly(tmp_path: Pat
     assert check(build(SMALL, 1), tmp_path, "vision_encoder", EXACT, form) < 5e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
     [
@@ -110,6 +113,7 @@ STORED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("half", [False, True], ids=["float", "half"])
 @pytest.mark.parametrize("precision", BOUNDS)
 @pytest.mark.parametrize(
@@ -138,6 +142,7 @@ def test_every_combination_runs_as_the_network_and_stores_its_precision_or_is_re
     assert {stored[n] for n in layers if n.split(".")[0] in ("blocks", "layers", "key_values")} == {STORED[precision]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["fp32", "fp16"])
 def test_a_convolutional_stem_is_as_exact_as_the_graphs_default(nano: TicVla, tmp_path: Path, precision: str) -> None:
     assert check(nano, tmp_path, "vision_encoder", Precision(precision), "plain", half=True) < 0.05
@@ -153,6 +158,7 @@ def test_a_layer_raised_to_32_bits_in_a_half_graph_is_computed_in_them(nano: Tic
     assert product.input[0] in widened
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ALL)
 def test_two_writings_are_the_same_bytes(nano: TicVla, tmp_path: Path, name: str) -> None:
     contents = []
@@ -163,6 +169,7 @@ def test_two_writings_are_the_same_bytes(nano: TicVla, tmp_path: Path, name: str
     assert contents[0] == contents[1]
 
 
+@pytest.mark.slow
 def test_a_failed_writing_leaves_nothing(nano: TicVla, tmp_path: Path) -> None:
     broken = build(NANO, 0)
     broken.vision.projector[1] = torch.nn.Identity()  # type: ignore[assignment]
@@ -185,6 +192,7 @@ def test_every_layer_that_can_be_named_is_in_its_graph(nano: TicVla, tmp_path: P
     assert all(f"{layer}.weight" in stored for layer in fused.values())
 
 
+@pytest.mark.slow
 def test_the_graphs_of_a_large_pair_share_one_token_table(
     nano: TicVla, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -204,6 +212,7 @@ def test_the_graphs_of_a_large_pair_share_one_token_table(
         assert result.max_abs < 5e-5
 
 
+@pytest.mark.slow
 def test_the_plain_int8_encoder_rounds_the_inputs_of_products_and_nothing_else(tmp_path: Path) -> None:
     model = build(SMALL, 1)
     frames = [references(model, "vision_encoder", 4)[i].feeds["frame"] for i in range(4)]

@@ -8,6 +8,7 @@ import statistics
 from collections.abc import Iterator
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tokenizers import Tokenizer
@@ -78,12 +79,14 @@ def routes() -> Iterator[RouteDescription]:
     yield RouteDescription((leaving,), *end, leaves_room=True, length_m=9.0)
 
 
+@pytest.mark.slow
 def test_every_word_of_the_grammar_of_training_is_one_token() -> None:
     texts = [text for seed, route in enumerate(routes()) for text in wordings(route, 12, seed, held_out=False)]
     words = {word for text in texts for word in re.findall(r"[A-Za-z]+", text)}
     assert len(texts) > 500 and len(words) > 100 and in_pieces(words) == []
 
 
+@pytest.mark.slow
 def test_everything_that_can_be_named_is_one_token_a_word() -> None:
     scenes = [load_scene(name) for name in scene_names()]
     names = {thing.landmark for scene in scenes for thing in scene.landmarks()}
@@ -97,6 +100,7 @@ def test_every_word_of_the_traces_is_one_token() -> None:
     assert in_pieces(words) == []
 
 
+@pytest.mark.slow
 def test_the_longest_answer_that_training_writes_fits_every_target() -> None:
     room = min(load_target(name, "nano").runtime.max_new_tokens for name in list_targets())
     far = "\n" + format_waypoints(((-12.5, 30.4), (-20.1, -25.3), (29.9, -30.9)))
@@ -130,6 +134,7 @@ def test_the_tokenizer_is_what_its_word_lists_give() -> None:
     assert [made.encode(text).ids for text in instructions()] == [TOKENIZER.encode(t).ids for t in instructions()]
 
 
+@pytest.mark.slow
 @given(st.text(max_size=80))
 def test_any_text_survives(text: str) -> None:
     ids = TOKENIZER.encode(text, add_special_tokens=False).ids

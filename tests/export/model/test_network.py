@@ -68,6 +68,7 @@ def variant(**fields: object) -> TicVla:
     return build(dataclasses.replace(NANO, action=dataclasses.replace(NANO.action, **fields)), 0)
 
 
+@pytest.mark.slow
 def test_without_latency_awareness_the_metadata_changes_nothing() -> None:
     kv = torch.randn(1, 20, NANO.kv_dim)
     with torch.no_grad():
@@ -84,6 +85,7 @@ def test_without_motion_offset_only_the_time_counts() -> None:
         assert not torch.equal(act(model, kv, [2.0, 0.0, 0.0, 0.0]), act(model, kv, [3.0, 0.0, 0.0, 0.0]))
 
 
+@pytest.mark.slow
 def test_values_only_ignores_the_keys() -> None:
     kv = torch.randn(1, 20, NANO.kv_dim)
     other = kv.clone()
@@ -152,12 +154,14 @@ def test_pixel_shuffle_puts_a_square_of_cells_into_one() -> None:
     assert sorted(shuffled[0, 0, 1].tolist()) == [2, 3, 6, 7]
 
 
+@pytest.mark.slow
 def test_leaving_out_torchs_own_initial_weights_changes_none_of_ours(model: TicVla) -> None:
     twice = TicVla(NANO).eval()
     initialise(twice, 0)
     assert weights_sha256(model) == weights_sha256(twice)
 
 
+@pytest.mark.slow
 def test_one_part_alone_is_filled_without_touching_the_others(model: TicVla) -> None:
     other = build(NANO, 0)
     initialise(other, 1, ("action",))

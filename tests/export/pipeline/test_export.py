@@ -144,6 +144,7 @@ def test_a_failed_gate_leaves_no_directory(cache: StageCache, tmp_path: Path, mo
     assert [path.name for path in tmp_path.iterdir()] == ["made"]
 
 
+@pytest.mark.slow
 def test_a_threshold_that_is_not_met_is_exit_code_1_and_no_directory(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -155,6 +156,7 @@ def test_a_threshold_that_is_not_met_is_exit_code_1_and_no_directory(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_value_near_its_limit_is_a_warning_that_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     assert main([*RANDOM, "--out", str(out), "--set", "gates.task.warn_waypoint_cm=1e-9"]) == 0
@@ -177,6 +179,7 @@ def test_two_exports_of_the_same_weights_are_byte_identical_with_nothing_cached(
     assert [path.name for path in tmp_path.iterdir()] == ["cold"]
 
 
+@pytest.mark.slow
 def test_a_cached_export_is_byte_identical_even_if_the_first_was_changed(artifacts_dir: Path, tmp_path: Path) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
     assert main([*RANDOM, "--out", str(first)]) == 0
@@ -222,6 +225,7 @@ def test_an_interrupted_export_leaves_nothing_half_written_and_goes_on_where_it_
     subprocess.run(["diff", "-r", str(artifacts_dir), str(out)], check=True, timeout=60)
 
 
+@pytest.mark.slow
 def test_weights_that_are_trained_or_other_threads_choose_a_precision_anew(
     cache: StageCache, monkeypatch: pytest.MonkeyPatch
 ) -> None:

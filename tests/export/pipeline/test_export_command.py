@@ -18,6 +18,7 @@ LOOSE = [
 ]  # for an encoder that is rounded
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "kept"), [([], "finished stages are in the cache"), (["--no-cache"], "nothing was kept")]
 )
@@ -37,6 +38,7 @@ def test_targets_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert [line.split("\t")[0] for line in capsys.readouterr().out.splitlines()] == list_targets()
 
 
+@pytest.mark.slow
 def test_a_dry_run_prints_the_plan_and_builds_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -49,6 +51,7 @@ def test_a_dry_run_prints_the_plan_and_builds_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arguments", [["--dry-run"], ["--out", "x"]])
 def test_a_plan_that_does_not_fit_is_refused_before_anything_is_built(
     arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

@@ -118,6 +118,7 @@ def test_a_damaged_directory_does_not_verify_and_is_not_touched(
     assert sorted(tmp_path.iterdir()) == beside
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["a truncated manifest", "no manifest"])
 def test_a_damaged_directory_is_not_exported_over(
     artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], case: str
@@ -184,6 +185,7 @@ WRONG_ARGUMENTS: list[tuple[list[str], str]] = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "message"), WRONG_ARGUMENTS, ids=lambda v: " ".join(v) if isinstance(v, list) else ""
 )

@@ -15,6 +15,7 @@ from export.pipeline.artifacts import build_artifacts, workplace
 from tests.support.export.export_job import job, manifest, progress
 
 
+@pytest.mark.slow
 def test_an_artifact_directory_with_something_of_the_users_in_it_is_not_replaced(
     artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -44,6 +45,7 @@ def test_a_failed_swap_puts_the_old_directory_back(
     load_artifacts(out)
 
 
+@pytest.mark.slow
 def test_a_foreign_directory_is_not_touched(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter1.tex").write_text("years of work")
@@ -88,6 +90,7 @@ def test_an_older_directory_of_ours_is_replaced_if_its_files_match_its_manifest(
     load_artifacts(out)
 
 
+@pytest.mark.slow
 def test_a_second_export_into_one_directory_is_refused(
     artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -99,6 +102,7 @@ def test_a_second_export_into_one_directory_is_refused(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_the_directory_that_a_killed_export_replaced_is_restored(artifacts_dir: Path, tmp_path: Path) -> None:
     work = tmp_path / ".nano.edge-export"
     shutil.copytree(artifacts_dir, work / "old")

@@ -28,14 +28,17 @@ def text_of(report: dict[str, Any]) -> str:
     return " ".join(" ".join(HtmlPage(report_html(report)).pieces).split())
 
 
+@pytest.mark.slow
 def test_the_page_is_made_of_report_json_alone(artifacts_dir: Path, report: dict[str, Any]) -> None:
     assert report_html(report) == (artifacts_dir / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_the_page_loads_nothing(report: dict[str, Any]) -> None:
     assert_loads_nothing(report_html(report))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["vision_encoder", "language_model", "semantic_context", "action_expert"])
 def test_every_graph_has_its_size_exactness_verdict_and_reason(report: dict[str, Any], name: str) -> None:
     graph, text = report["graphs"][name], text_of(report)
@@ -46,6 +49,7 @@ def test_every_graph_has_its_size_exactness_verdict_and_reason(report: dict[str,
     assert text.count("PASS") == 4
 
 
+@pytest.mark.slow
 def test_plan_calibration_and_provenance_are_on_the_page(report: dict[str, Any]) -> None:
     text = text_of(report)
     assert f"{report['plan']['tick_ms']:,.4g} ms" in text
@@ -55,18 +59,21 @@ def test_plan_calibration_and_provenance_are_on_the_page(report: dict[str, Any])
     assert f"onnxruntime {report['provenance']['packages']['onnxruntime']}" in text
 
 
+@pytest.mark.slow
 def test_graphs_come_in_the_order_in_which_they_run(report: dict[str, Any]) -> None:
     text = text_of(report)
     places = [text.index(name) for name in ("vision_encoder", "language_model", "semantic_context", "action_expert")]
     assert places == sorted(places)
 
 
+@pytest.mark.slow
 def test_untrained_weights_are_marked_and_trained_ones_are_not(changed: dict[str, Any]) -> None:
     assert "The weights are untrained" in report_html(changed)
     changed["model"]["trained"] = True
     assert "untrained" not in report_html(changed)
 
 
+@pytest.mark.slow
 def test_a_graph_checked_on_another_provider_is_marked(changed: dict[str, Any]) -> None:
     assert "repeat this check" not in report_html(changed)
     changed["graphs"]["vision_encoder"]["session"]["provider"] = "TensorrtExecutionProvider"
@@ -77,6 +84,7 @@ def test_a_graph_checked_on_another_provider_is_marked(changed: dict[str, Any]) 
     assert "edge-export verify DIR" in text
 
 
+@pytest.mark.slow
 def test_a_warning_is_shown_with_its_reason(changed: dict[str, Any]) -> None:
     changed["graphs"]["action_expert"]["parity"] |= {"verdict": "WARN", "reasons": ["cosine 0.995 (≥ 0.999)"]}
     text = text_of(changed)
@@ -84,12 +92,14 @@ def test_a_warning_is_shown_with_its_reason(changed: dict[str, Any]) -> None:
     assert "action_expert : cosine 0.995 (≥ 0.999)" in text
 
 
+@pytest.mark.slow
 def test_a_plan_that_does_not_fit_gives_the_reason(changed: dict[str, Any]) -> None:
     changed["plan"] |= {"fits": False, "reasons": ["tick 250 ms exceeds the period of 100 ms"], "generation_ms": None}
     text = text_of(changed)
     assert "Does not fit: tick 250 ms exceeds the period of 100 ms" in text
 
 
+@pytest.mark.slow
 def test_the_halves_of_a_language_model_share_its_thresholds(changed: dict[str, Any]) -> None:
     whole = changed["graphs"].pop("language_model")
     changed["graphs"] |= {f"language_model.{half}": whole for half in ("prefill", "decode")}
@@ -97,6 +107,7 @@ def test_the_halves_of_a_language_model_share_its_thresholds(changed: dict[str, 
     assert text.index("language_model.prefill") < text.index("language_model.decode")
 
 
+@pytest.mark.slow
 def test_layers_that_were_searched_are_plotted(changed: dict[str, Any]) -> None:
     row = {"precision": "int8", "waypoint_cm": 0.3}
     changed["sensitivity"]["vision_encoder"] = {
@@ -113,6 +124,7 @@ def test_layers_that_were_searched_are_plotted(changed: dict[str, Any]) -> None:
     )
 
 
+@pytest.mark.slow
 def test_text_from_files_cannot_act_on_the_page(changed: dict[str, Any]) -> None:
     evil = "<script>alert(1)</script>\u202e"
     changed["provenance"]["weights_origin"] = evil

@@ -28,10 +28,12 @@ from tests.edge.inference.test_self_test import loop_for_ever
 from tests.support.export.export_job import manifest
 
 
+@pytest.mark.slow
 def test_verify_repeats_the_gate(artifacts_dir: Path) -> None:
     assert main(["verify", str(artifacts_dir)]) == 0
 
 
+@pytest.mark.slow
 def test_verify_runs_the_limited_self_test_before_any_gate(
     artifacts_dir: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -108,6 +110,7 @@ def resealed(directory: Path, keys: str, value: object) -> Path:
     return directory
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("keys", "value", "message"),
     [
@@ -154,6 +157,7 @@ def test_tolerances_of_an_exporter_without_the_provider_are_accepted_for_an_acce
     assert (found == expected) is accepted
 
 
+@pytest.mark.slow
 def test_another_tokenizer_does_not_verify_although_the_manifest_vouches_for_it(
     artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -185,6 +189,7 @@ def test_a_directory_for_a_users_target_names_the_origin_of_its_thresholds(
     assert "checked against the thresholds in the manifest" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_verify_refuses_artifacts_of_other_weights(artifacts_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["verify", str(artifacts_dir), "--random-weights", "5"]) == 1
     assert "other weights" in capsys.readouterr().err

@@ -70,6 +70,7 @@ def test_a_plan_that_exceeds_power_age_or_memory_names_the_limit(name: str, sett
     assert not made.fits and any(reason in line for line in made.reasons)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("budget_w", [23.0, 25.0, 27.0])
 def test_reasoning_gets_what_the_budget_leaves_and_never_more(budget_w: float) -> None:
     made = planned("orin", f"power.budget_w={budget_w}", "runtime.max_delay_s=60")
@@ -88,12 +89,14 @@ def test_tokens_are_cut_so_that_the_state_stays_young_enough() -> None:
     assert any("keep Δt in bounds" in warning for warning in made.warnings)
 
 
+@pytest.mark.slow
 def test_a_tick_waits_at_most_for_the_call_in_flight_where_both_threads_share_a_device() -> None:
     made = planned("orin")
     longest = max(stage(made, name)["call_ms"] for name in ("prefill", "decode", "semantic_context"))
     assert made.tick.ms == pytest.approx(made.tick_alone.ms + longest, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_development_machine_reports_its_late_stages_and_is_not_refused() -> None:
     made = planned("cpu")
     assert not made.fits
@@ -127,6 +130,7 @@ def with_point(base: Target, **changes: object) -> Target:
     return dataclasses.replace(base, measured=(point,))
 
 
+@pytest.mark.slow
 def test_a_measured_point_replaces_the_model_and_names_its_device() -> None:
     entry = stage(plan(with_point(target("orin")), BIG), "vision_encoder")
     assert (entry["ms"], entry["tagged"], entry["bound"]) == (61.5, MEASURED, MEASURED)
@@ -187,6 +191,7 @@ def test_a_call_projects_its_last_positions_onto_the_vocabulary(graph: str, toke
     assert call.workspace - blind.workspace == scored * BIG.language.vocab
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["orin", "cpu"])
 def test_a_context_of_waypoints_has_three_tokens_and_belongs_to_the_tick(name: str) -> None:
     config = dataclasses.replace(BIG, action=dataclasses.replace(BIG.action, semantic_interface="waypoints"))

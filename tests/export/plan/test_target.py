@@ -85,6 +85,7 @@ def test_a_file_that_is_not_a_target_is_refused_by_name(tmp_path: Path, text: st
         load_target(str(path))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "line"),
     [
@@ -223,6 +224,7 @@ def test_a_wrong_setting_is_refused_with_one_line_and_near_names(setting: str, l
     assert "\n" not in str(refusal.value)
 
 
+@pytest.mark.slow
 def test_an_engine_gets_a_profile_for_every_free_axis_and_only_what_it_can_run() -> None:
     inputs = [{"name": "context_keys", "shape": [6, 8, 64, "T"]}, {"name": "state", "shape": [1, 3]}]
     session = load_target("orin").session("action_expert", inputs)

@@ -25,6 +25,7 @@ def normal(rows: int, columns: int) -> np.ndarray:
     return np.random.default_rng(3).standard_normal((rows, columns)).astype(np.float32)
 
 
+@pytest.mark.slow
 @given(weights)
 def test_per_channel_rounding_is_within_half_a_step(weight: np.ndarray) -> None:
     q = quantise_channels(weight)

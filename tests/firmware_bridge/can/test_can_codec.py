@@ -23,6 +23,7 @@ each_signal = pytest.mark.parametrize(("robot", "place"), SIGNALS, ids=map("-".j
 a_signal = st.sampled_from(SIGNALS)
 
 
+@pytest.mark.slow
 @each_signal
 @given(data=st.binary(min_size=8, max_size=8))
 def test_the_bits_of_a_signal_are_those_that_cantools_finds(robot: str, place: str, data: bytes) -> None:
@@ -32,6 +33,7 @@ def test_the_bits_of_a_signal_are_those_that_cantools_finds(robot: str, place: s
     assert signal.raw(data) == raw
 
 
+@pytest.mark.slow
 @settings(max_examples=400)
 @given(chosen=a_signal, share=st.floats(0, 1))
 def test_an_encoded_value_is_the_one_that_cantools_decodes(chosen: tuple[str, str], share: float) -> None:
@@ -47,6 +49,7 @@ def test_an_encoded_value_is_the_one_that_cantools_decodes(chosen: tuple[str, st
     assert found * factor == pytest.approx(value, abs=abs(signal.scale) * 0.51)
 
 
+@pytest.mark.slow
 @settings(max_examples=400)
 @given(chosen=a_signal, value=st.floats(-1e6, 1e6))
 def test_a_value_beyond_the_range_is_sent_as_its_end(chosen: tuple[str, str], value: float) -> None:
@@ -77,6 +80,7 @@ def test_a_crc_is_the_one_computed_bit_by_bit(data: bytes, polynomial: int, init
     assert Crc(8, polynomial, initial, final_xor).of(data) == crc_bit_by_bit(data, polynomial, initial, final_xor)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", CONFIGS)
 @given(commands=st.lists(st.tuples(st.floats(-0.4, 0.8), st.floats(-1, 1)), min_size=1, max_size=40))
 def test_the_base_accepts_counter_and_crc_of_every_velocity(robot: str, commands: list[tuple[float, float]]) -> None:

@@ -124,6 +124,7 @@ def test_a_failsafe_that_is_weakened_while_driving_stops_the_rover() -> None:
     assert status.state == "stopped" and "COM_OF_LOSS_T" in status.reason and status.last_command == (0.0, 0.0, 0.0)
 
 
+@pytest.mark.slow
 def test_a_rover_that_never_answers_for_its_parameters_is_not_armed() -> None:
     bench = RoverBench()
     bench.to_bridge = lambda packet: () if packet[7:10] == b"\x16\x00\x00" else (packet,)  # 22: PARAM_VALUE

@@ -82,6 +82,7 @@ class TestArming:
         assert first - before[0] >= 1000 * MS
         assert max(b - a for a, b in itertools.pairwise(before)) <= 500 * MS
 
+    @pytest.mark.slow
     @given(seed=st.integers(0, 2**32 - 1))
     @settings(max_examples=15)
     def test_it_arms_over_a_radio_that_loses_30_percent(self, seed: int) -> None:
@@ -90,6 +91,7 @@ class TestArming:
         bench.drive(timeout_s=30.0)
         assert bench.node.vehicle.armed
 
+    @pytest.mark.slow
     @given(seed=st.integers(0, 2**32 - 1))
     @settings(max_examples=15)
     def test_repeated_and_reordered_packets_stop_no_drive(self, seed: int) -> None:
@@ -126,6 +128,7 @@ class TestTakeover:
         assert bench.status is not None and bench.status.cause == "estop"
         assert all(at - since_ns <= 20 * MS for at in moving)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("autopilot", list(AUTOPILOTS))
     def test_after_the_pilots_switch_only_an_operators_arm_drives_the_rover_again(self, autopilot: str) -> None:
         bench = driving(autopilot)
@@ -138,6 +141,7 @@ class TestTakeover:
         bench.operator = [Arm()]
         bench.until(lambda: bench.status is not None and bench.status.state == "armed", 10.0, "armed by the operator")
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("autopilot", list(AUTOPILOTS))
     def test_after_the_pilots_switch_no_mode_is_requested(self, autopilot: str) -> None:
         bench = driving(autopilot)
@@ -162,6 +166,7 @@ class TestTakeover:
         bench.until(lambda: bench.mode is Mode.OFFBOARD, 10.0, "an arming")
         bench.drive()
 
+    @pytest.mark.slow
     def test_a_new_run_ends_no_mission_without_an_operators_arm(self) -> None:
         bench = RoverBench()
         bench.asking = False
@@ -259,6 +264,7 @@ class TestTakeover:
 
 
 class TestOtherSystems:
+    @pytest.mark.slow
     @given(system=st.integers(2, 255))
     @settings(max_examples=15)
     def test_values_of_another_system_change_nothing(self, system: int) -> None:
@@ -294,6 +300,7 @@ class TestFailures:
         assert not any(vx for at, vx in setpoints(bench, since_ns + 300 * MS))
         assert bench.status is not None and bench.status.cause == "state_silent"
 
+    @pytest.mark.slow
     def test_missing_heartbeats_stop_the_rover_although_odometry_arrives(self) -> None:
         bench = driving()
         bench.to_bridge = lambda packet: () if packet[7:10] == b"\0\0\0" else (packet,)
@@ -339,6 +346,7 @@ class TestSigning:
         bench.run(10.0)
         assert not bench.node.vehicle.armed and bench.session.watch.mode is None
 
+    @pytest.mark.slow
     @given(seed=st.integers(0, 2**32 - 1), late=st.integers(1, 200))
     @settings(max_examples=10)
     def test_replayed_packets_change_nothing(self, seed: int, late: int) -> None:

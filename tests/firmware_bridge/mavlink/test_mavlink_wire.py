@@ -39,6 +39,7 @@ NOISE = st.binary(max_size=40).filter(lambda data: not {0xFD, 0xFE} & set(data))
 
 
 class TestStream:
+    @pytest.mark.slow
     @given(
         noise=st.lists(NOISE, min_size=4, max_size=4),
         cuts=st.lists(st.integers(1, 30), min_size=1),

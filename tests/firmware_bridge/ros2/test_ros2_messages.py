@@ -95,6 +95,7 @@ def test_every_type_of_the_list_is_there() -> None:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", TYPES, ids=ros_name)
 def test_the_bytes_are_those_of_another_serialiser_in_both_directions(kind: type) -> None:
     @settings(max_examples=15)

@@ -36,6 +36,7 @@ def rules(config: RobotConfig, now_ns: int) -> BridgeCore:
     return BridgeCore(config.bridge, config.limits, config.safety, robot_table(config), now_ns)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("client", [False, True], ids=["no runner", "a runner that did not ask"])
 def test_any_messages_on_any_topic_leave_the_bridge_disarmed_and_silent(
     link: RobotLink, dds_domain: int, monkeypatch: pytest.MonkeyPatch, client: bool

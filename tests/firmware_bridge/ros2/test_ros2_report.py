@@ -134,6 +134,7 @@ CONVERTERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", CONVERTERS, ids=lambda kind: kind.__name__)
 def test_any_changed_bytes_are_refused_or_become_finite_values(kind: type) -> None:
     """Bytes of a valid message with some of them replaced: they reach the conversion far more often than any bytes."""

@@ -246,6 +246,7 @@ def changed(good: bytes) -> st.SearchStrategy[bytes]:
     return st.builds(change, st.sampled_from([0, 0, 0, 1, 9, 100]), st.lists(places, max_size=6))
 
 
+@pytest.mark.slow
 def test_no_bytes_raise_out_of_a_step_or_become_a_state_that_is_not_finite(
     lonely_link: RobotLink, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -133,6 +133,7 @@ class TestOrder:
             order.accept(state(100 * S + now_ns + ahead_ns, received_ns=now_ns + 10 * ms))
         assert longest_ms <= 520
 
+    @pytest.mark.slow
     def test_a_robots_clock_may_drift_and_its_reports_may_be_late(self) -> None:
         order, ms = StampOrder(), S // 1000
         for k in range(20_000):

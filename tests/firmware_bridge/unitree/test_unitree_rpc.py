@@ -246,6 +246,7 @@ def test_no_trace_is_written_and_ten_participants_a_host_are_found() -> None:
     assert "<MaxAutoParticipantIndex>9</MaxAutoParticipantIndex>" in xml
 
 
+@pytest.mark.slow
 def test_a_client_that_leaves_is_not_a_malformed_request(bus: Bus, dds_domain: int) -> None:
     server = ServiceServer(bus, "leaving")
     code = (

@@ -174,6 +174,7 @@ def check_stands(stack: Stack, host: HostStall, ended_ns: int) -> None:
     assert not stack.is_moving()
 
 
+@pytest.mark.slow
 def test_the_runners_bridge_is_stopped_as_by_an_operator_and_its_run_ends(stack: Stack) -> None:
     with HostStall() as host, stack.drive() as runner:
         wait_for(stack.is_moving, 20, "the robot to be told to move")

@@ -151,6 +151,7 @@ def test_a_page_gets_the_result_of_the_run(view: View) -> None:
     assert view.run(watch) == ["/tick", "/result"]
 
 
+@pytest.mark.slow
 def test_the_next_run_may_listen_at_once_although_a_stop_is_still_under_way(tmp_path: Path) -> None:
     bridge = Bridge(tmp_path / "bridge.sock")
     feed = LiveFeed(LiveOptions(port=0), tmp_path / "bridge.sock", lambda: False, print)

@@ -49,6 +49,7 @@ def _travelled(rows: np.ndarray) -> np.ndarray:
     return np.hypot(*np.moveaxis(np.diff(rows[:, :, :2], axis=0), -1, 0)).sum(axis=0)
 
 
+@pytest.mark.slow
 def test_the_seed_decides_everything_and_reading_the_state_changes_nothing(corridor: Scene) -> None:
     read, unread = People(corridor, 5, 3), People(corridor, 5, 3)
     for _ in range(10 * UPDATE_HZ):
@@ -68,6 +69,7 @@ def test_crowds_that_share_destinations_leave_nothing_behind_in_them(hospital: S
     assert not np.array_equal(first, _walk(People(hospital, 10, 4, shared), 10.0))
 
 
+@pytest.mark.slow
 def test_people_walk_at_walking_speed_without_jumping(corridor: Scene) -> None:
     rows = _walk(People(corridor, 4, 1), 20.0)
     steps = np.hypot(*np.moveaxis(np.diff(rows[:, :, :2], axis=0), -1, 0)) * UPDATE_HZ
@@ -183,6 +185,7 @@ def test_two_streams_pass_each_other_in_a_narrow_corridor(hall: Scene) -> None:
     assert travelled.min() > 6.0
 
 
+@pytest.mark.slow
 def test_a_person_on_a_platform_stands_on_it(hall: Scene) -> None:
     stage = Terrain("stage", "platform", (15.0, 0.0, 0.0), 0.0, (10.0, 4.0), 0.2, "concrete")
     rows = _walk(People(replace(hall, terrain=(stage,)), 10, 0), 30.0)

@@ -90,6 +90,7 @@ def test_some_people_are_inattentive_and_react_later() -> None:
     assert crowd.reaction_s[crowd.inattentive].mean() > crowd.reaction_s[~crowd.inattentive].mean() + 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_no_person_runs_into_a_robot_that_stands_in_the_middle_of_a_corridor(seed: int) -> None:
     scene = load_scene("corridor")

@@ -95,6 +95,7 @@ def test_a_room_that_was_walled_up_is_found(made: dict[str, Scene]) -> None:
     assert any("cannot be reached" in line for line in found)
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_scene_and_a_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, picture = tmp_path / "w.toml", tmp_path / "w.png"
     code = main(["warehouse", "--seed", str(SEED), "--out", str(out), "--map", str(picture), "--json", "-"])

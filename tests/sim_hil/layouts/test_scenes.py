@@ -15,6 +15,7 @@ def test_a_shipped_scene_is_opened_by_its_name() -> None:
     assert open_scene("corridor") == load_scene("corridor")
 
 
+@pytest.mark.slow
 def test_a_reserved_layout_is_generated_and_has_the_name_of_its_kind_and_seed() -> None:
     scene = open_scene(layout_name("warehouse", 61))
     assert scene.name == "warehouse-61"

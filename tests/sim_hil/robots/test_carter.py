@@ -109,6 +109,7 @@ def test_turning_in_place_it_stays_inside_its_circle(make: Make) -> None:
     assert math.hypot(*world.truth().position_m[:2]) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("v", [0.3, 0.6, 1.5])
 def test_it_climbs_a_ramp_of_8_degrees_rests_on_it_and_backs_down(make: Make, v: float) -> None:
     world = make()
@@ -148,6 +149,7 @@ def test_a_kerb_of_15_cm_stops_it_and_triggers_its_front_bumper(make: Make, v: f
     assert world.robot.up() > 0.99
 
 
+@pytest.mark.slow
 def test_wheels_that_spin_at_a_kerb_carry_the_odometry_on_without_the_robot(make: Make) -> None:
     world = make()
     world.box((5.0, 0.0, 0.075), (8.0, 6.0, 0.15))
@@ -155,6 +157,7 @@ def test_wheels_that_spin_at_a_kerb_carry_the_odometry_on_without_the_robot(make
     assert truth.odometry.T_odom_base.x_m - truth.position_m[0] > 0.5
 
 
+@pytest.mark.slow
 def test_on_a_clean_floor_odometry_is_nearly_right_and_never_the_truth(make: Make) -> None:
     world = make().go()
     for v, w in ((1.0, 0.0), (0.5, 1.0), (0.8, -0.7), (1.2, 0.0)):
@@ -189,6 +192,7 @@ def test_the_pushed_bumper_reports_contact_and_releases(make: Make, side: str, c
     assert world.run(1.5, -0.3 * sign).bumpers == Bumpers()
 
 
+@pytest.mark.slow
 def test_driving_draws_the_battery_down_faster_than_standing(make: Make) -> None:
     standing, driving = make().go(), make()
     driving.ramp(0.5, 8.0, 30.0)
@@ -197,6 +201,7 @@ def test_driving_draws_the_battery_down_faster_than_standing(make: Make) -> None
     assert 100.0 > left[0] > left[1]
 
 
+@pytest.mark.slow
 def test_severe_odometry_noise_moves_the_report_away_and_none_does_not(make: Make) -> None:
     world = make().go()
     exact, severe = CarterSensors(world.robot), CarterSensors(world.robot, odometry_noise="severe", seed=3)

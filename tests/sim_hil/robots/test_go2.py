@@ -51,6 +51,7 @@ def _stand(simulation: Simulation) -> None:
     _run(simulation, 0.2)
 
 
+@pytest.mark.slow
 def test_a_lying_robot_stands_up_locked_and_only_then_balances(simulation: Simulation) -> None:
     _run(simulation, 0.5)
     truth = simulation.truth()
@@ -70,6 +71,7 @@ def test_a_lying_robot_stands_up_locked_and_only_then_balances(simulation: Simul
     assert truth.accel_mps2 == pytest.approx((0, 0, 9.81), abs=0.4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("prepare", [(), (SportAction.STAND_UP,), (SportAction.DAMP,)])
 def test_move_has_no_effect_unless_balanced(simulation: Simulation, prepare: tuple[SportAction, ...]) -> None:
     for action in prepare:
@@ -91,6 +93,7 @@ def test_positive_yaw_turns_left_and_positive_vy_walks_left(simulation: Simulati
     assert simulation.truth().rpy_rad[2] > 0.2
 
 
+@pytest.mark.slow
 def test_a_move_is_held_one_second_and_then_the_robot_stands_still(simulation: Simulation) -> None:
     _stand(simulation)
     simulation.command(0.5, 0.0, 0.0)
@@ -106,6 +109,7 @@ def test_a_move_is_held_one_second_and_then_the_robot_stands_still(simulation: S
     assert np.linalg.norm(simulation.truth().position_m - rest.position_m) < 0.02
 
 
+@pytest.mark.slow
 def test_stop_move_takes_effect_at_once(simulation: Simulation) -> None:
     _stand(simulation)
     _run(simulation, 1.0, (0.5, 0.0, 0.0))
@@ -215,6 +219,7 @@ def test_velocities_agree_with_positions(simulation: Simulation) -> None:
     assert moved == pytest.approx(np.mean(velocities, axis=0) * (after.time_s - before.time_s), abs=0.003)
 
 
+@pytest.mark.slow
 def test_feet_carry_the_robot_where_kinematics_places_them(simulation: Simulation) -> None:
     _stand(simulation)
     truth = simulation.truth()

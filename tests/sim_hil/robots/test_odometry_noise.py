@@ -45,6 +45,7 @@ def test_the_velocity_is_that_of_the_reported_pose() -> None:
     assert (report.vx_mps, report.vy_mps, report.wz_radps) == pytest.approx(tuple(v / 0.1 for v in moved.as_tuple()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step_m", [0.01, 0.1])
 def test_the_drift_of_a_metre_has_the_levels_size_for_any_step(step_m: float) -> None:
     level = LEVELS["typical"]

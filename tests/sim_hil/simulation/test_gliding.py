@@ -40,6 +40,7 @@ def run(simulation: Simulation, seconds: float, velocity: tuple[float, float, fl
 
 @pytest.mark.parametrize("robot", ROBOTS)
 class TestEveryStandIn:
+    @pytest.mark.slow
     def test_it_is_as_far_from_its_robot_as_a_step_after_three_seconds(self, robot: str) -> None:
         given = commands(20.0, seed=2)
         real, glide = (drive(robot, given, glides=glides) for glides in (False, True))
@@ -104,6 +105,7 @@ class TestEveryStandIn:
             assert x_m == pytest.approx(-4.6, abs=0.3) and high_m - low_m == pytest.approx(0.15, abs=0.01)
             assert simulation.collided_with() == set()
 
+    @pytest.mark.slow
     def test_the_same_seed_and_commands_give_the_same_motion(self, robot: str) -> None:
         states = []
         for _ in range(2):
@@ -117,6 +119,7 @@ class TestEveryStandIn:
             assert len(simulation.render_state()) == MOUNTS[robot].fields
 
 
+@pytest.mark.slow
 def test_a_person_who_stands_in_the_way_is_a_collision() -> None:
     with gliding(load_scene("corridor"), people=6, start=(9.0, 0.0, 0.0)) as simulation:
         for _ in range(600):

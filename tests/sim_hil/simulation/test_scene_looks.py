@@ -149,6 +149,7 @@ def test_no_sky_shines_through_where_walls_meet_floor_and_ceiling() -> None:
             assert not purple.any()
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     st.lists(st.tuples(st.floats(-6, 6), st.floats(-6, 6)), min_size=3, max_size=7),

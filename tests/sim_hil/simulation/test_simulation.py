@@ -45,6 +45,7 @@ def test_any_robot_gets_ready_and_drives_as_commanded(robot: str) -> None:
         assert simulation.truth().commanded[0] == pytest.approx(0.6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", ["go2", "carter"])
 def test_the_same_seed_and_commands_give_the_same_motion(robot: str) -> None:
     states = []
@@ -63,6 +64,7 @@ def test_a_start_of_its_own_takes_the_place_of_the_scenes() -> None:
         assert simulation.scene.start == (2.0, 1.0, 1.5)
 
 
+@pytest.mark.slow
 def test_a_robot_that_starts_on_a_platform_stands_on_it() -> None:
     platform = Terrain("platform", "platform", (-8.0, 0.0, 0.0), 0.0, (3.0, 3.0), 0.3, "concrete")
     with simulated(replace(hall(), terrain=(platform,))) as simulation:
@@ -70,6 +72,7 @@ def test_a_robot_that_starts_on_a_platform_stands_on_it() -> None:
         assert 0.5 < simulation.pose()[0][2] < 0.7
 
 
+@pytest.mark.slow
 def test_no_person_walks_while_the_robot_gets_ready() -> None:
     with simulated(load_scene("corridor"), people=3) as simulation:
         before = simulation.people()
@@ -77,6 +80,7 @@ def test_no_person_walks_while_the_robot_gets_ready() -> None:
         assert np.array_equal(simulation.people(), before) and simulation.time_s > 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate_hz", [240, 500])
 def test_people_keep_their_own_rate(rate_hz: int) -> None:
     with simulated(load_scene("corridor"), people=2, rate_hz=rate_hz) as simulation:
@@ -88,6 +92,7 @@ def test_people_keep_their_own_rate(rate_hz: int) -> None:
         assert changes == pytest.approx(UPDATE_HZ, abs=1)
 
 
+@pytest.mark.slow
 def test_only_people_near_the_robot_have_a_body() -> None:
     seen = set()
     with simulated(load_scene("corridor"), people=6, start=(9.0, 0.0, 0.0), rate_hz=240) as simulation:
@@ -103,6 +108,7 @@ def test_only_people_near_the_robot_have_a_body() -> None:
     assert seen == {True, False}
 
 
+@pytest.mark.slow
 def test_a_contact_ends_but_the_collision_stays_recorded() -> None:
     with simulated(hall(block(-7.0, 0.0, 0.5, 2.0)), rate_hz=240) as simulation:
         simulation.settle()

@@ -35,6 +35,7 @@ def test_a_task_begins_at_the_robot_and_has_a_feasible_path(office: Scene) -> No
         at = (*task.goal_xy, 0.0)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_tasks(office: Scene) -> None:
     first, second = (Journey(office, seed=4, leg=2, speed_mps=0.8) for _ in range(2))
     at = first.begin()

@@ -22,6 +22,7 @@ def test_every_graph_is_profiled_by_operator(artifacts_dir: Path, tmp_path: Path
         assert graph["total_ms"] == pytest.approx(sum(entry["ms"] for entry in graph["operators"].values()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", [["--graphs", "nothing"], ["--context", "0"], ["--context", "9999"]])
 def test_a_graph_that_cannot_be_profiled_is_one_line(
     artifacts_dir: Path, wrong: list[str], capsys: pytest.CaptureFixture[str]

@@ -16,6 +16,7 @@ from tools.bench.roofline import COUNTED, Measurement, intervals, load_rows, mai
 DECODE = Measurement("a board", "published", "orin", "decode", "int4-b128", "a page", tokens_per_s=50.0)
 
 
+@pytest.mark.slow
 def test_the_shipped_measurements_are_all_predicted(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--json", "-"]) == EXIT_DONE
     result = json.loads(capsys.readouterr().out)
@@ -41,6 +42,7 @@ def test_twice_the_bandwidth_nearly_halves_the_predicted_time_of_decoding() -> N
     assert slow.predicted.ms - overhead_ms == pytest.approx(2 * (fast.predicted.ms - overhead_ms))
 
 
+@pytest.mark.slow
 def test_a_fitted_row_and_other_software_change_no_interval() -> None:
     rows = [predict(replace(DECODE, tokens_per_s=rate), PRESETS["1b"]) for rate in (40.0, 60.0)]
     more = [
@@ -56,6 +58,7 @@ def test_the_worst_assumption_is_that_of_the_furthest_counted_ratio() -> None:
     assert found.measurement.tokens_per_s == 1.0 and "memory_efficiency = 0.6" in found.assumption
 
 
+@pytest.mark.slow
 def test_a_prediction_without_any_measurement_keeps_its_own_error_bar() -> None:
     assert all(row["low_ms"] < row["ms"] < row["high_ms"] for row in predictions({}))
 

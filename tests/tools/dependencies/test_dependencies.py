@@ -58,18 +58,21 @@ def test_a_package_without_a_licence_is_a_problem() -> None:
     )
 
 
+@pytest.mark.slow
 def test_every_package_of_this_project_has_a_permitted_licence() -> None:
     policy = read_policy()
     packages, _ = installed(policy)
     assert len(packages) > 60 and problems(packages, policy) == []
 
 
+@pytest.mark.slow
 def test_no_licence_of_the_gpl_reaches_an_install_for_use() -> None:
     packages, _ = installed(read_policy())
     found = {each.name for each in packages if each.licence.startswith(("GPL", "AGPL")) and set(each.extras) != {"dev"}}
     assert found == set()
 
 
+@pytest.mark.slow
 def test_notice_names_every_package_that_an_install_for_use_brings() -> None:
     text = NOTICE.read_text(encoding="utf-8")
     packages, _ = installed(read_policy())
@@ -96,6 +99,7 @@ def test_the_bill_of_materials_links_every_package_to_what_it_needs() -> None:
     assert set(links) == {each["bom-ref"] for each in document["components"]} | {"pkg:pypi/tic-vla-edge@1.0"}
 
 
+@pytest.mark.slow
 def test_the_command_writes_the_bill_of_materials(tmp_path: Path) -> None:
     assert main(["sbom", "--extras", "cpu", "--out", str(tmp_path / "sbom.json")]) == 0
     names = {each["name"] for each in json.loads((tmp_path / "sbom.json").read_text())["components"]}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from edge.flightlog.explain.explanation import explain
 from edge.flightlog.explain.flight import Truth
@@ -37,6 +38,7 @@ def test_the_texts_picture_shows_its_own_waypoints_and_no_plan(tmp_path: Path) -
     assert event.min() < CARD_PX / 2 < event.max()
 
 
+@pytest.mark.slow
 def test_an_explanation_asks_for_the_picture_of_its_own_text(tmp_path: Path) -> None:
     def touched(second: float) -> Truth:
         return flights.truth(second, touching=("plant",) if 10.0 <= second < 10.3 else ())

@@ -55,6 +55,7 @@ def test_training_wordings_are_of_no_benchmark_pattern_and_as_many() -> None:
         assert all(is_held_out(text) for text in before.instructions)
 
 
+@pytest.mark.slow
 def test_both_go_together() -> None:
     part = [each for each in EPISODES if each.scene == "warehouse"]
     both = Conditions(PolicySpec("still"), wordings="training", swap_instructions=3)

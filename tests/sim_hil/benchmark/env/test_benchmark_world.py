@@ -32,6 +32,7 @@ def reached() -> Iterator[EpisodeWorld]:
         yield world
 
 
+@pytest.mark.slow
 def test_the_robot_begins_at_the_episodes_start_ready_to_move() -> None:
     with EpisodeWorld(corridor_episode(start=(2.0, 0.3, 0.5))) as world:
         pose = world.pose()
@@ -40,6 +41,7 @@ def test_the_robot_begins_at_the_episodes_start_ready_to_move() -> None:
         assert world.observe().state == (0.0, 0.0, 0.0) and world.observe().T_odom_base == SE2(0.0, 0.0, 0.0)
 
 
+@pytest.mark.slow
 def test_one_step_is_three_frames_of_a_thirtieth_of_a_second() -> None:
     with EpisodeWorld(corridor_episode()) as world:
         world.step(FORWARD)
@@ -60,6 +62,7 @@ def test_an_episode_that_is_over_takes_no_further_step(reached: EpisodeWorld) ->
         reached.step(FORWARD)
 
 
+@pytest.mark.slow
 def test_a_policy_may_linger_at_the_goal() -> None:
     with EpisodeWorld(corridor_episode(robot="carter"), WorldOptions(linger_s=1.0)) as world:
         drive(world, FORWARD, 200)
@@ -82,6 +85,7 @@ def test_without_drift_odometry_equals_the_true_path(reached: EpisodeWorld) -> N
     assert reached.observe().state[0] == pytest.approx(0.8, abs=0.15)
 
 
+@pytest.mark.slow
 def test_a_timeout_ends_the_episode_without_success() -> None:
     with EpisodeWorld(corridor_episode(timeout_s=0.5)) as world:
         drive(world, (0.0, 0.0, 0.0), 10)
@@ -89,6 +93,7 @@ def test_a_timeout_ends_the_episode_without_success() -> None:
         assert not world.outcome().success and world.outcome().spl == 0.0
 
 
+@pytest.mark.slow
 def test_an_outcome_before_the_end_is_refused_unless_the_episode_is_stopped() -> None:
     with EpisodeWorld(corridor_episode()) as world:
         with pytest.raises(RuntimeError, match="not over"):
@@ -97,6 +102,7 @@ def test_an_outcome_before_the_end_is_refused_unless_the_episode_is_stopped() ->
         assert world.done and world.outcome().end == "stopped"
 
 
+@pytest.mark.slow
 def test_a_person_nearby_is_a_collision_hidden_from_the_robot() -> None:
     with EpisodeWorld(corridor_episode(), scene=hall()) as world:
         pose = world.pose()
@@ -106,6 +112,7 @@ def test_a_person_nearby_is_a_collision_hidden_from_the_robot() -> None:
         assert not world.observe().touching and not world.observe().collided
 
 
+@pytest.mark.slow
 def test_driving_into_an_object_is_a_collision_with_it() -> None:
     scene, episode = hall(block(-6.5, 0.0, 0.5, 2.0)), corridor_episode(start=(-8.0, 0.0, 0.0), goal_xy=(8.0, 0.0))
     with EpisodeWorld(episode, scene=scene) as world:
@@ -119,6 +126,7 @@ def test_driving_into_an_object_is_a_collision_with_it() -> None:
         assert outcome.first_collision_s is not None and 0.5 < outcome.first_collision_s < 3.0
 
 
+@pytest.mark.slow
 def test_the_touched_one_of_many_neighbouring_objects_is_identified() -> None:
     # Neighbours share a body in the physics engine.
     things = [block(-8.0 + 1.2 * k, side, 0.5, 0.5) for k in range(1, 9) for side in (-1.6, 1.6)]
@@ -130,6 +138,7 @@ def test_the_touched_one_of_many_neighbouring_objects_is_identified() -> None:
         assert world.outcome().collisions == ("block -6.0 0.0",)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("velocity", [(float("nan"), 0.0, 0.0), (0.1, 0.0, float("inf")), (0.1, 0.2)])
 def test_a_velocity_that_is_none_is_refused(reached: EpisodeWorld, velocity: tuple[float, ...]) -> None:
     with EpisodeWorld(corridor_episode()) as world, pytest.raises(ValueError, match="velocities"):
@@ -142,6 +151,7 @@ def test_options_that_make_no_world_are_refused(options: dict[str, object]) -> N
         WorldOptions(**options)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_a_picture_has_the_requested_size_and_is_taken_once_an_observation() -> None:
     with EpisodeWorld(corridor_episode(), WorldOptions(camera=(64, 48))) as world:
         image = world.observe().image
@@ -165,6 +175,7 @@ def test_the_same_episode_gives_the_same_bytes_again_and_in_another_process() ->
     assert there.stdout.split()[-1] == here
 
 
+@pytest.mark.slow
 def test_people_are_updated_at_thirty_hertz_with_the_reported_velocities() -> None:
     with EpisodeWorld(corridor_episode(people=4)) as world:
         drive(world, (0.0, 0.0, 0.0), 20)
@@ -183,6 +194,7 @@ def drift_after_ten_metres(level: str, seed: int) -> float:
     return hypot(odometer.pose.x_m - pose.x_m, odometer.pose.y_m - pose.y_m)
 
 
+@pytest.mark.slow
 def test_drift_grows_with_its_level() -> None:
     typical, severe = (
         np.mean([drift_after_ten_metres(level, s) for s in range(20)]) for level in ("typical", "severe")

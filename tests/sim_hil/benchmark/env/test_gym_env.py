@@ -38,6 +38,7 @@ def test_gymnasiums_own_check_passes() -> None:
     env.close()
 
 
+@pytest.mark.slow
 def test_it_is_registered() -> None:
     made = gymnasium.make(ENV_ID, suite=EPISODES, camera=None)
     _, info = made.reset(seed=1, options={"episode": "short"})
@@ -45,6 +46,7 @@ def test_it_is_registered() -> None:
     made.close()
 
 
+@pytest.mark.slow
 def test_the_episode_named_is_begun_with_the_wording_named(env: DynaNavEnv) -> None:
     _, info = env.reset(options={"episode": "long", "wording": 1})
     assert (info["episode"], info["instruction"]) == ("long", "Go straight on.")
@@ -62,6 +64,7 @@ def test_unknown_options_are_refused(env: DynaNavEnv, options: dict[str, str]) -
         env.reset(options=options)
 
 
+@pytest.mark.slow
 def test_reaching_the_goal_terminates_with_the_goals_reward_and_an_outcome(env: DynaNavEnv) -> None:
     env.reset(options={"episode": "short"})
     rewards, terminated, truncated, info = [], False, False, {}
@@ -91,6 +94,7 @@ def test_another_object_is_another_collision() -> None:
     assert _begun("wall", "wall person", "person") == [True, True, False]
 
 
+@pytest.mark.slow
 def test_a_detour_round_a_wall_is_progress_though_the_goal_grows_no_nearer() -> None:
     """A cabinet 4 m wide stands between start and goal: sideways is the way."""
     episode = corridor_episode(id="detour", start=(-2.0, 0.0, pi / 2), goal_xy=(4.0, 0.0), scene="hall")
@@ -105,6 +109,7 @@ def test_a_detour_round_a_wall_is_progress_though_the_goal_grows_no_nearer() -> 
     assert info["distance_m"] > far_m and total > 2.0
 
 
+@pytest.mark.slow
 def test_an_episode_without_a_way_is_refused_at_its_reset() -> None:
     walled = hall(block(0.0, 0.0, 0.5, 10.0))
     env = DynaNavEnv([corridor_episode(id="walled", start=(-2.0, 0.0, 0.0))], camera=None, scenes={"corridor": walled})
@@ -118,12 +123,14 @@ def test_no_suite_is_the_default() -> None:
         gymnasium.make(ENV_ID)
 
 
+@pytest.mark.slow
 def test_the_timeout_truncates(env: DynaNavEnv) -> None:
     env.reset(options={"episode": "long"})
     ends = [env.step(np.zeros(3, np.float32))[2:4] for _ in range(10)]
     assert ends == [(False, False)] * 9 + [(False, True)]
 
 
+@pytest.mark.slow
 def test_an_action_out_of_range_is_clipped(env: DynaNavEnv) -> None:
     env.reset(options={"episode": "short"})
     observation, *_ = env.step(np.array((0.0, 0.0, 9.0), np.float32))
@@ -131,6 +138,7 @@ def test_an_action_out_of_range_is_clipped(env: DynaNavEnv) -> None:
     assert env.world.robot.truth(0.0).commanded[2] == pytest.approx(1.2)
 
 
+@pytest.mark.slow
 def test_another_crowd_seed_makes_other_people(env: DynaNavEnv) -> None:
     env.reset(options={"episode": "long"})
     before = env.world.people()

@@ -93,6 +93,7 @@ def test_an_episode_is_recorded_like_a_flight_of_the_runner(policies: dict[str, 
         assert topic == "/camera" or complaints(json.loads(encode(record, 1)), SCHEMAS[topic]) == []
 
 
+@pytest.mark.slow
 def test_the_model_receives_the_delay_and_motion_of_virtual_time(policies: dict[str, ArtifactsPolicy]) -> None:
     rows = drive(policies["async"], 12)
     inputs = [
@@ -106,11 +107,13 @@ def test_odometry_that_reports_another_motion_changes_the_motion_offset(policies
     assert notes["offset"][0] == pytest.approx(0.3)
 
 
+@pytest.mark.slow
 def test_the_same_pictures_give_the_same_commands_bit_for_bit(policies: dict[str, ArtifactsPolicy]) -> None:
     first, again, other = (drive(policies["async"], 12, seed=seed) for seed in (1, 1, 2))
     assert [command for command, _ in first] == [command for command, _ in again] != [command for command, _ in other]
 
 
+@pytest.mark.slow
 def test_commands_keep_the_robots_limits_and_slew(policies: dict[str, ArtifactsPolicy]) -> None:
     commands = np.array([command for command, _ in drive(policies["async"], 20)])
     assert np.abs(commands[:, 0]).max() <= LIMITS.vx_max_mps and np.abs(commands[:, 2]).max() <= LIMITS.wz_max_radps
@@ -118,6 +121,7 @@ def test_commands_keep_the_robots_limits_and_slew(policies: dict[str, ArtifactsP
     assert faster.max() <= LIMITS.accel_mps2 * 0.1 + 1e-9
 
 
+@pytest.mark.slow
 def test_sync_drives_half_a_second_with_delay_zero_and_halts_for_the_latency(
     policies: dict[str, ArtifactsPolicy],
 ) -> None:
@@ -172,6 +176,7 @@ def test_without_guesses_each_token_of_the_same_text_costs_a_call(
     assert expected["new_tokens"] <= len(expected["call_tokens"]) <= expected["new_tokens"] + 1
 
 
+@pytest.mark.slow
 def test_the_same_episode_takes_the_same_calls_whatever_was_driven_before(guessing: ArtifactsPolicy) -> None:
     drive(guessing, 12)
     first = guessing.generations()
@@ -180,6 +185,7 @@ def test_the_same_episode_takes_the_same_calls_whatever_was_driven_before(guessi
     assert guessing.generations() == first
 
 
+@pytest.mark.slow
 def test_a_device_that_guesses_nothing_takes_one_call_a_token(
     guessing: ArtifactsPolicy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -188,6 +194,7 @@ def test_a_device_that_guesses_nothing_takes_one_call_a_token(
     assert {tokens for record in guessing.generations() for tokens in record["call_tokens"]} == {1}
 
 
+@pytest.mark.slow
 def test_more_rows_than_this_machine_computes_exactly_are_refused(
     artifacts_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -199,6 +206,7 @@ def test_more_rows_than_this_machine_computes_exactly_are_refused(
         by_calls(artifacts_dir)
 
 
+@pytest.mark.slow
 def test_generations_have_times_of_the_episode(policies: dict[str, ArtifactsPolicy]) -> None:
     policy = policies["async"]
     drive(policy, 12)
@@ -216,6 +224,7 @@ def asked(directory: Path, **changed: Any) -> Conditions:
     return replace(made, **changed)
 
 
+@pytest.mark.slow
 def test_a_worker_refuses_artifacts_that_are_not_those_of_the_run(artifacts_dir: Path) -> None:
     with pytest.raises(ArtifactError, match="expected the artifacts that started this run"):
         open_policy(asked(artifacts_dir), manifest_sha256="0" * 64)

@@ -96,6 +96,7 @@ def test_without_the_world_it_is_refused() -> None:
         ExpertPolicy().reset(corridor_episode(), "Go.", None, 0)
 
 
+@pytest.mark.slow
 def test_a_goal_without_a_way_to_it_is_refused() -> None:
     episode = corridor_episode(start=(-4.0, 0.0, 0.0), goal_xy=(4.0, 0.0))
     with (
@@ -200,6 +201,7 @@ def test_it_keeps_to_the_prescribed_route_where_another_is_shorter() -> None:
     assert np.hypot(*(route[-1] - np.array(GOAL))) < 0.2
 
 
+@pytest.mark.slow
 def test_it_drives_at_the_speed_it_is_given_and_reports_its_choice() -> None:
     episode = corridor_episode(robot="carter", timeout_s=2.5)
     teacher = ExpertPolicy(margin_m=0.1, speed_mps=0.5)

@@ -91,6 +91,7 @@ def connect(address: Address, *, timeout_s: float = 5.0, latency: LatencyProfile
     return ExternalPolicy(address, LIMITS, timeout_s=timeout_s, latency=latency)
 
 
+@pytest.mark.slow
 @given(header=_headers, payload=st.binary(max_size=300), cuts=st.lists(st.integers(0, 400), max_size=5))
 def test_a_message_survives_any_fragmentation(header: dict[str, Any], payload: bytes, cuts: list[int]) -> None:
     data, decoder, found = encode(Message(header, payload)), Decoder(), []

@@ -51,6 +51,7 @@ def test_failures_are_counted_by_cause(run: Path) -> None:
     assert rows[0][1] == "the plan drives, the command does not: camera-frozen"
 
 
+@pytest.mark.slow
 def test_the_contact_sheet_shows_each_failure(run: Path) -> None:
     sheet = failure_sheet(failures(run, RESULTS))
     assert sheet is not None and jpeg_size(sheet) == (1600, 352)

@@ -36,6 +36,7 @@ def test_every_group_has_the_same_numbers() -> None:
     assert summary["by_scene"]["office"]["sr"] == 100 and summary["by_scene"]["office"]["sr_ci95"] is None
 
 
+@pytest.mark.slow
 def test_intervals_do_not_depend_on_the_order_in_which_episodes_finish() -> None:
     results = mixed(31)
     shuffled = random.Random(3).sample(results, len(results))
@@ -80,6 +81,7 @@ def test_tasks_count_by_their_episodes() -> None:
     assert one_task is not None and one_task == pytest.approx((35, 65), abs=3)
 
 
+@pytest.mark.slow
 def test_summaries_resample_the_tasks_of_their_results() -> None:
     made = [fakes.result if task % 2 else fakes.missed for task in range(10)]
     repeated = [make(f"e{task}-{i}", task=f"t{task}") for task, make in enumerate(made) for i in range(5)]
@@ -170,6 +172,7 @@ def test_compare_prints_both_runs_and_their_difference(tmp_path: Path, capsys: p
     assert "2 episodes in both" in message and "+100.00" in message and "succeeded in B only: e1, e3" in message
 
 
+@pytest.mark.slow
 def test_no_output_about_the_fresh_suite_names_an_episode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     a = run_of(tmp_path / "a", FRESH, suite="dynanav-fresh")
     b = run_of(tmp_path / "b", [replace(FRESH[0], success=False, spl=0.0)], suite="dynanav-fresh")

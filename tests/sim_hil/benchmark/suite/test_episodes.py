@@ -60,6 +60,7 @@ def test_no_two_episodes_have_one_seed() -> None:
     assert len({episode.seed for episode in EPISODES}) == len(EPISODES)
 
 
+@pytest.mark.slow
 def test_the_file_is_what_the_builder_builds() -> None:
     # One task stands for all here; `build_suite --check` compares the whole.
     part = next(part for part in PARTS if part.scene == "warehouse")

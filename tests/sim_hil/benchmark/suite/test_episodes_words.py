@@ -186,6 +186,7 @@ def test_a_description_is_read_as_ordered_claims() -> None:
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_one_way_has_thousands_of_wordings_all_true(way: RouteDescription) -> None:
     texts = [text for seed in range(25) for text in wordings(way, 50, seed, held_out=False)]
     assert len(set(texts)) > 1000
@@ -193,6 +194,7 @@ def test_one_way_has_thousands_of_wordings_all_true(way: RouteDescription) -> No
     assert [text for text in texts if untrue(text, way)] == []
 
 
+@pytest.mark.slow
 def test_benchmark_and_training_share_no_pattern(way: RouteDescription) -> None:
     ours = {pattern(text) for seed in range(10) for text in wordings(way, 20, seed, held_out=True)}
     theirs = {pattern(text) for seed in range(10) for text in wordings(way, 20, seed, held_out=False)}

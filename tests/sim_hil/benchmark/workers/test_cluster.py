@@ -88,6 +88,7 @@ def test_a_killed_workers_episode_is_run_again_and_none_is_lost_or_counted_twice
     ]
 
 
+@pytest.mark.slow
 def test_an_address_without_a_cluster_is_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ClusterError, match=r"--cluster nonsense: no Ray cluster there"):
         ClusterJobs("nonsense")

@@ -52,6 +52,7 @@ def serial_bytes(identifier: int, data: bytes) -> bytes:
     return b"\xaa\0\0\0\0" + bytes((len(data),)) + identifier.to_bytes(4, "little") + data + b"\xbb"
 
 
+@pytest.mark.slow
 @given(st.lists(st.tuples(st.integers(0, 0x7FF), st.binary(max_size=8)), max_size=5), st.data())
 def test_serial_frames_are_found_in_any_chunks_of_bytes(sent: list[tuple[int, bytes]], cuts: st.DataObject) -> None:
     stream = b"".join(serial_bytes(*frame) for frame in sent)

@@ -90,6 +90,7 @@ def open_rig(link: str, client: BusAddress, **changes: object) -> Rig:
     return PatientRig(simulation, front_end, ContractClient(client))
 
 
+@pytest.mark.slow
 class TestContractOnASerialLine(FrontEndContract):
     @pytest.fixture
     def rig(self, tmp_path: Path) -> Iterator[Rig]:
@@ -131,6 +132,7 @@ def _counts(rig: Rig) -> dict[str, int]:
     return counts
 
 
+@pytest.mark.slow
 def test_a_link_with_faults_counts_them_and_still_drives(tmp_path: Path) -> None:
     path = tmp_path / "can"
     link = f"serial:{path},drop=0.1,corrupt=0.05,duplicate=0.05,delay=0.05,delay_s=0.03"
@@ -190,6 +192,7 @@ def test_the_red_button_stops_it_and_a_reset_needs_it_released(ask: tuple[Rig, C
     rig.until(lambda: _can(rig).state == frames.STATE_IDLE, 2.0, "idle")
 
 
+@pytest.mark.slow
 def test_bus_off_stops_the_base_until_the_bus_is_on_again(ask: tuple[Rig, Callable[..., object]]) -> None:
     rig, switch = ask
     rig.make_ready()
@@ -214,6 +217,7 @@ def test_an_invalid_fault_request_is_answered_with_an_error(
     assert "expected" in str(ask[1](**command)["error"])
 
 
+@pytest.mark.slow
 def test_a_fault_is_switched_on_and_off_and_all_are_cleared(ask: tuple[Rig, Callable[..., dict[str, object]]]) -> None:
     rig, switch = ask
     assert switch(fault="drop", value=1.0)["on"] is True

@@ -28,6 +28,7 @@ def numbers(frames: list[Frame]) -> list[int]:
     return [int.from_bytes(frame.data, "little") for frame in frames]
 
 
+@pytest.mark.slow
 @settings(max_examples=8, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_the_same_seed_gives_the_same_fate(seed: int) -> None:
@@ -35,6 +36,7 @@ def test_the_same_seed_gives_the_same_fate(seed: int) -> None:
     assert passed(plan, seed) == passed(plan, seed)
 
 
+@pytest.mark.slow
 def test_seeds_and_directions_differ() -> None:
     plan = FaultPlan(drop=0.5)
     assert len({tuple(numbers(passed(plan, seed, way))) for seed in (0, 1) for way in (0, 1)}) == 4
@@ -64,6 +66,7 @@ def test_a_delayed_frame_is_overtaken() -> None:
     assert sorted(arrived) == list(range(COUNT)) and arrived != sorted(arrived)
 
 
+@pytest.mark.slow
 def test_a_corrupted_frame_is_never_taken_for_a_good_one() -> None:
     shim, encoder, decoder = FaultShim(FaultPlan(corrupt=1.0), 3, 0), Encoder(), Decoder("Controller")
     for number in range(COUNT):

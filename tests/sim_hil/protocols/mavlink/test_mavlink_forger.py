@@ -33,6 +33,7 @@ def test_on_a_signed_link_each_attack_changes_nothing(kind: str) -> None:
     assert bench.status is not None and bench.status.state == "armed" and bench.session.reader.counts.malformed > 20
 
 
+@pytest.mark.slow
 def test_on_an_unsigned_link_another_system_changes_nothing() -> None:
     status = attacked(OTHER_SYSTEM, None).status
     assert status is not None and status.state == "armed"
@@ -43,6 +44,7 @@ def test_on_an_unsigned_link_a_forged_heartbeat_stops_the_rover() -> None:
     assert status is not None and status.cause == "estop"
 
 
+@pytest.mark.slow
 def test_on_an_unsigned_link_recorded_packets_never_take_the_rover_from_a_pilot() -> None:
     bench, forger, active = RoverBench(), Forger(1, None, 0), list[str]()
     bench.to_bridge = lambda packet: (packet, *forger.packets(packet, active))

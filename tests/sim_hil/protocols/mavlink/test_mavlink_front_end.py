@@ -130,6 +130,7 @@ def test_excess_addresses_are_refused(rig: Rig) -> None:
             client.close()
 
 
+@pytest.mark.slow
 def test_a_fixed_address_receives_only_heartbeats_until_it_answers() -> None:
     listener = MavlinkClient(("127.0.0.1", 9))
     rig = open_rig(f"udp:127.0.0.1:0,to=127.0.0.1:{listener.address[1]}")
@@ -176,6 +177,7 @@ def _switch(path: Path, **fault: object) -> None:
         asking.sendto(json.dumps(fault).encode(), str(path))
 
 
+@pytest.mark.slow
 def test_a_rover_is_driven_over_a_lossy_late_reordering_link() -> None:
     rig = open_rig("udp:127.0.0.1:0,loss_percent=30,jitter_ms=50,reorder_percent=20,duplicate_percent=20")
     try:

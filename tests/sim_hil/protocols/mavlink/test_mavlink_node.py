@@ -190,6 +190,7 @@ def test_an_unusable_setpoint_is_counted_and_reported_once(link: Link) -> None:
 _CLASSES = sorted(common.mavlink_map.items())
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(_CLASSES), st.binary(min_size=255, max_size=255)), max_size=8))
 def test_any_content_of_any_message_is_harmless(chosen: list[tuple[tuple[int, type], bytes]]) -> None:

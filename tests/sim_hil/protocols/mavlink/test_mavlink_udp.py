@@ -47,6 +47,7 @@ def test_the_same_seed_gives_the_same_arrivals_and_another_one_does_not() -> Non
     assert arrivals(plan, regular(300), 4) == arrivals(plan, regular(300), 4) != arrivals(plan, regular(300), 5)
 
 
+@pytest.mark.slow
 @given(st.lists(st.floats(0, 1), min_size=50, max_size=50))
 def test_the_lost_and_duplicated_packets_do_not_depend_on_the_time_of_sending(gaps: list[float]) -> None:
     plan = Impairment(loss_percent=30, loss_burst=3, duplicate_percent=20)

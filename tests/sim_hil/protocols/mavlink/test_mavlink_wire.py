@@ -39,6 +39,7 @@ def test_every_message_of_a_datagram_is_read(numbers: list[int]) -> None:
     assert reader.counts.malformed == 0
 
 
+@pytest.mark.slow
 @settings(max_examples=200)
 @given(st.binary(min_size=1, max_size=300))
 def test_any_bytes_are_harmless(data: bytes) -> None:

@@ -97,6 +97,7 @@ class TestAvoidance:
         desk.avoid.handle(1003, '{"x": 0.4, "y": 0, "yaw": 0, "mode": 0}')
         assert desk.behaviour.commanded == (0.0, 0.0, 0.0)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(("mode", "goal"), [(1, (0.6, 0.0, 0.5)), (2, None)])
     def test_it_goes_to_a_place(self, stage: Stage, mode: int, goal: tuple[float, float, float] | None) -> None:
         stage.avoid.handle(1004, '{"is_remote_commands_from_api": true}')
@@ -109,6 +110,7 @@ class TestAvoidance:
         assert math.hypot(left.x_m, left.y_m) < 0.12 and abs(left.theta_rad) < 0.15
         assert stage.behaviour.commanded == (0.0, 0.0, 0.0)
 
+    @pytest.mark.slow
     def test_a_stop_ends_the_way_to_a_place(self, stage: Stage) -> None:
         stage.avoid.handle(1004, '{"is_remote_commands_from_api": true}')
         stage.avoid.handle(1003, '{"x": 3, "y": 0, "yaw": 0, "mode": 1}')
@@ -119,6 +121,7 @@ class TestAvoidance:
         stage.run(1.0)
         assert abs(stage.pose().x_m - where.x_m) < 0.05
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("api_id", "parameter"),
         [(1001, {}), (1005, {}), (1009, {}), (1010, {}), (1016, {}), (1028, {"data": True}), (1028, {"data": False}),

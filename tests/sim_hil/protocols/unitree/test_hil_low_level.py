@@ -110,6 +110,7 @@ def test_damaged_commands_are_counted_and_the_last_good_one_stays() -> None:
     assert low.torques(still(), 0.1) == pytest.approx((5.0,) * 12)
 
 
+@pytest.mark.slow
 def test_low_commands_stand_a_released_robot_up_and_without_them_it_sinks() -> None:
     simulation = Simulation(load_scene("corridor"), people=0, seed=0)
     robot = simulation.robot

@@ -157,6 +157,7 @@ def test_no_process_is_left_behind(tmp_path: Path, faulty: Faulty, monkeypatch: 
 # -- orders and draws -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_layouts_of_evaluation_and_reinforcement_learning_are_not_collected() -> None:
     found = {
         replace(_collection(), seed=seed, turn=1).orders(Path("folder"), lambda _: False)[0].scenario_seed
@@ -166,6 +167,7 @@ def test_layouts_of_evaluation_and_reinforcement_learning_are_not_collected() ->
     assert EvaluateConfig().scenario_seed in KEPT_SEEDS
 
 
+@pytest.mark.slow
 def test_scenarios_are_drawn_in_the_requested_shares() -> None:
     config = CollectConfig(noise_share=0.3, sharp_share=0.2, typical_drift_share=0.5, severe_drift_share=0.1)
     draws = [Draw.of(config, 7, number) for number in range(3000)]
@@ -183,6 +185,7 @@ def test_the_expert_drives_no_faster_than_a_policy_may() -> None:
 # -- the real thing ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_real_drive_is_made_of_a_training_scenario_and_is_the_same_in_any_process(tmp_path: Path) -> None:
     config = CollectConfig(episodes=1, kinds={"corridor": 1.0}, noise_share=0.0)
     with DatasetWriter(tmp_path / "here") as here, DatasetWriter(tmp_path / "process") as there:

@@ -52,6 +52,7 @@ def _nothing(_: EpisodeWorld, chosen: NDArray[np.float64]) -> Mapping[str, Any]:
     return {}
 
 
+@pytest.mark.slow
 def test_a_policys_drive_is_labelled_by_the_expert(artifacts: Artifacts) -> None:
     episode = corridor_episode(robot="carter", timeout_s=4.0)
     plan = DrivePlan(
@@ -70,6 +71,7 @@ def test_a_policys_drive_is_labelled_by_the_expert(artifacts: Artifacts) -> None
     assert np.all(np.hypot(*recorded.arrays["future"][:20, 29, :2].T) > 0.3)
 
 
+@pytest.mark.slow
 def test_in_the_experts_stretches_the_policy_goes_on_seeing(
     artifacts: Artifacts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -91,6 +93,7 @@ def test_in_the_experts_stretches_the_policy_goes_on_seeing(
     assert inputs == [(wanted, EXPERT)] * 5 and seen == [0.0, 0.1, 0.2, 0.3, 0.4]
 
 
+@pytest.mark.slow
 def test_other_artifacts_than_the_rounds_are_refused(artifacts: Artifacts) -> None:
     options = PolicyOptions(str(artifacts.directory), "0" * 64, 0.0, 2.0)
     with pytest.raises(ArtifactError, match="not the artifacts"):
@@ -113,6 +116,7 @@ def _job(folder: Path, **dagger: Any) -> StageJob:
     return StageJob(Recipe("test", 1, PRESETS["nano"], dagger=config), RunDir(folder), seed=5)
 
 
+@pytest.mark.slow
 def test_the_expert_helps_less_in_every_round_and_drives_other_scenarios(
     tmp_path: Path, artifacts: Artifacts, filled: list[Collection]
 ) -> None:
@@ -123,6 +127,7 @@ def test_the_expert_helps_less_in_every_round_and_drives_other_scenarios(
     assert len(seeds) == 3
 
 
+@pytest.mark.slow
 def test_a_round_that_was_begun_with_other_artifacts_is_not_gone_on_with(
     tmp_path: Path, artifacts: Artifacts, filled: list[Collection]
 ) -> None:
@@ -132,6 +137,7 @@ def test_a_round_that_was_begun_with_other_artifacts_is_not_gone_on_with(
     assert not filled
 
 
+@pytest.mark.slow
 def test_new_drives_of_the_expert_come_with_a_round_in_layouts_of_their_own(
     tmp_path: Path, artifacts: Artifacts, filled: list[Collection]
 ) -> None:

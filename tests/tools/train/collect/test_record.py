@@ -103,6 +103,7 @@ def test_traces_are_recorded_once_a_second_in_order(reached: Recorded) -> None:
     assert len(times) == (len(reached.arrays["pose"]) - 1) // 10 + 1
 
 
+@pytest.mark.slow
 def test_a_drive_of_a_body_without_wheels_is_as_long_and_as_fast(reached: Recorded) -> None:
     glided = _drive(_expert_command, legs=False)
     assert glided.outcome == "reached" and not glided.collided
@@ -110,11 +111,13 @@ def test_a_drive_of_a_body_without_wheels_is_as_long_and_as_fast(reached: Record
     assert np.allclose(glided.arrays["state"][20:40], reached.arrays["state"][20:40], atol=0.03)
 
 
+@pytest.mark.slow
 def test_a_drive_off_the_described_route_is_rejected() -> None:
     with pytest.raises(NothingToLearnError, match="left the described route"):
         _drive(_expert_command, way=np.array(((0.0, 9.0), (6.0, 9.0))), timeout_s=4.0)
 
 
+@pytest.mark.slow
 def test_a_short_drive_is_not_kept() -> None:
     with pytest.raises(NothingToLearnError, match="less than 3 s are usable"):
         _drive(_expert_command, timeout_s=1.0)
@@ -198,5 +201,6 @@ def test_on_a_detour_the_label_leads_back_to_the_route() -> None:
     assert there.x_m > pose[last, 0] + 0.3
 
 
+@pytest.mark.slow
 def test_where_there_is_no_way_to_it_there_is_no_detour() -> None:
     assert set(_drive(_expert_command, detour=Detour((500.0, 0.0), 1.0, 1.0)).arrays["by"]) == {EXPERT}

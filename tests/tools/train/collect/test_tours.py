@@ -136,6 +136,7 @@ def test_a_layout_that_is_held_out_is_shown_by_no_tour(tmp_path: Path) -> None:
     assert not len(build_tours(same, numbers, config, 3, ranks=SINGLE, progress=QuietProgress()))
 
 
+@pytest.mark.slow
 def test_a_body_glides_along_a_route_and_not_through_walls() -> None:
     scenario = scenarios("office")[0]
     x, y, heading = scenario.episode.start

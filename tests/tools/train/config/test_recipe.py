@@ -114,6 +114,7 @@ def test_stages_have_seeds_of_their_own_that_follow_from_the_runs() -> None:
     assert stage_seed(replace(recipe, seed=2), "sft") not in seeds
 
 
+@pytest.mark.slow
 def test_a_variant_of_the_benchmark_is_trained_as_the_benchmark_checks_it() -> None:
     fields = {"head", "layers", "latency_aware", "motion_offset", "semantic_interface"}
     for name, wanted in BENCHMARK_VARIANTS.items():

@@ -106,6 +106,7 @@ def test_the_way_left_shrinks_metre_by_metre() -> None:
         assert all(b <= a + 0.15 for a, b in itertools.pairwise(left))
 
 
+@pytest.mark.slow
 def test_behind_a_wall_one_has_strayed_by_the_way_round_it() -> None:
     scenario = scenarios("hospital")[0]
     grid, progress = scenario.site.grid, progress_of(scenario)

@@ -120,6 +120,7 @@ def test_the_demos_corridor_is_itself_for_even_seeds_and_rearranged_for_odd_ones
 # -- drawing them ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_scenarios_whichever_of_them_are_drawn() -> None:
     kinds = {CORRIDOR: 1.0}
     together = [s.episode for s in training_episodes(SEED, 3, kinds, tasks_per_scene=2)]

@@ -76,6 +76,7 @@ def _person(pose: SE2, ahead_m: float, left_m: float) -> np.ndarray:
 # -- words -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_every_text_of_the_corpus_is_short_and_is_read_back_whole() -> None:
     for text in trace_words.corpus():
         assert len(text.rpartition("\n")[0].split()) <= trace_words.MAX_WORDS

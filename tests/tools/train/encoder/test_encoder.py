@@ -29,7 +29,7 @@ def trained(out: Path, **options: Any) -> Run:
     return Run(load_file(job.run_dir.model_path), list(job.run_dir.lines()), result)
 
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = [pytest.mark.usefixtures("one_thread"), pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return trained(tmp_path_factory.mktemp("whole"))
 
 
-@pytest.mark.slow
 def test_it_learns_more_than_a_fixed_answer(tmp_path: Path) -> None:
     config = dataclasses.replace(CONFIG, epochs=25, look_steps=25, optim=OptimConfig(lr=5e-3, warmup_steps=0))
     _, lines, result = trained(tmp_path, config=config)

@@ -28,6 +28,7 @@ def samples(tmp_path_factory: pytest.TempPathFactory) -> Samples:
     return Samples(drives, MadeUpTokens(), SideStates(dataset), delays, plain, tiny_model(), drop=False)
 
 
+@pytest.mark.slow
 def test_keeping_the_state_is_driving_on_along_its_arc() -> None:
     plans = keep_state(np.array([(0.5, 0.0, 0.0), (0.4, 0.0, 0.2), (0.0, 0.3, 0.5), (0.0, 0.0, 0.0)]), 50)
     np.testing.assert_allclose(plans[0, 19], (1.0, 0.0, 0.0), atol=1e-12)
@@ -52,6 +53,7 @@ def test_driving_to_waypoints_arrives_at_their_times() -> None:
     np.testing.assert_allclose(to_waypoints(points, 8.0, 20)[9:, :2], [(1.0, 4.0)] * 11, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_policy_that_plans_as_the_expert_does_makes_no_error(samples: Samples) -> None:
     result = evaluate(lambda batch: batch.target, samples, FEW, seed=1, device=CPU)
     policy = result["all"]["policy"]
@@ -62,6 +64,7 @@ def test_a_policy_that_plans_as_the_expert_does_makes_no_error(samples: Samples)
     assert kept["fde_m"]["3s"] > 0.05 and straight["fde_m"]["3s"] > 0.01
 
 
+@pytest.mark.slow
 def test_errors_are_listed_by_age_and_add_up(samples: Samples) -> None:
     result = evaluate(lambda batch: batch.target, samples, FEW, seed=1, device=CPU)
     bins = result["by_delay"]

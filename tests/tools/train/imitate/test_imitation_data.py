@@ -64,6 +64,7 @@ def drawn(samples: Samples, count: int, seed: int = 0) -> list[tuple[SampleChoic
     return found
 
 
+@pytest.mark.slow
 def test_age_and_motion_offset_are_exactly_those_between_state_and_frame(dataset: Dataset) -> None:
     samples = of(dataset)
     for chosen, group in drawn(samples, 60):
@@ -121,6 +122,7 @@ class SpoiledTokens:
         return self._tokens
 
 
+@pytest.mark.slow
 def test_nothing_after_the_frame_reaches_the_inputs_of_its_sample(tmp_path: Path) -> None:
     network, k = build(tiny_model(), 1), 64
     config = SampleConfig(cut_text=0.5)
@@ -213,6 +215,7 @@ def test_frames_of_a_robot_that_stands_against_its_label_are_drawn_more_often() 
     assert set(np.flatnonzero(weight == 4.0)) == {*range(30, 40), 45} and set(weight) == {1.0, 4.0}
 
 
+@pytest.mark.slow
 def test_a_robot_that_stands_in_its_first_frame_has_stood_there_before(dataset: Dataset) -> None:
     samples = of(dataset, dataclasses.replace(PLAIN, standing_start=1.0))
     stood = 0
@@ -242,6 +245,7 @@ def test_without_injected_delay_every_state_is_of_its_frame(dataset: Dataset) ->
         assert np.abs(group.latency).max() < 1e-12
 
 
+@pytest.mark.slow
 def test_tokens_and_states_are_dropped_at_the_networks_rates(dataset: Dataset) -> None:
     found = drawn(of(dataset, drop=True), 400)
     kept = np.concatenate([group.keep_guidance.ravel() for _, group in found])
@@ -251,6 +255,7 @@ def test_tokens_and_states_are_dropped_at_the_networks_rates(dataset: Dataset) -
         assert group.keep_guidance.all() and group.keep_state.all()
 
 
+@pytest.mark.slow
 def test_some_samples_are_blind_and_all_others_see_their_frame(dataset: Dataset) -> None:
     config = dataclasses.replace(PLAIN, blind=0.3)
     plain, some = of(dataset), of(dataset, config)
@@ -265,6 +270,7 @@ def test_some_samples_are_blind_and_all_others_see_their_frame(dataset: Dataset)
     assert config.undisturbed() == PLAIN
 
 
+@pytest.mark.slow
 def test_odometry_noise_grows_with_the_way_and_leaves_the_age(dataset: Dataset) -> None:
     samples = of(dataset, dataclasses.replace(PLAIN, offset_noise_m_per_m=0.05, offset_noise_deg_per_m=3.0))
     by_way: dict[bool, list[float]] = {False: [], True: []}

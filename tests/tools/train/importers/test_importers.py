@@ -137,6 +137,7 @@ def test_a_hole_in_the_pictures_cuts_the_recording() -> None:
 # -- episodes ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_episodes_are_of_twenty_seconds_and_the_rest_is_left_out(recording: Recording) -> None:
     found = list(drives(recording, "scand", "spot"))
     assert [drive.id for drive in found] == ["scand-A_Spot_1-0000", "scand-A_Spot_1-0001"]
@@ -145,6 +146,7 @@ def test_episodes_are_of_twenty_seconds_and_the_rest_is_left_out(recording: Reco
     assert found[0].about.driver == "imported" and found[0].about.robot == "spot" and not found[0].wordings
 
 
+@pytest.mark.slow
 def test_labels_are_the_driven_future_and_waypoints_where_it_then_was(recording: Recording) -> None:
     first, second = drives(recording, "scand", "spot")
     whole = pieces(recording)[0].pose
@@ -168,6 +170,7 @@ def test_pictures_are_squeezed_whole_to_128_pixels(recording: Recording) -> None
     assert picture.shape == (128, 128, 3) and np.abs(picture.mean() - 171) < 3
 
 
+@pytest.mark.slow
 def test_gnds_poses_in_space_become_poses_on_the_ground(recording_gnd: Recording) -> None:
     (drive,) = drives(recording_gnd, "gnd", "jackal")
     assert drive.id == "gnd-campus-1-0000"
@@ -186,6 +189,7 @@ TRACE = {
 }
 
 
+@pytest.mark.slow
 def test_an_instruction_belongs_to_its_own_episode(tmp_path: Path) -> None:
     texts = {"1": {"wordings": ["follow the path", "go along the path"], "traces": [TRACE] * 20}}
     first, second = drives(read_scand(_scand(tmp_path / "A", 41.0, texts)), "scand", "spot")
@@ -272,6 +276,7 @@ def test_a_file_that_is_no_picture_is_refused(tmp_path: Path) -> None:
 # -- the command ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_folder_of_recordings_becomes_a_data_set(tmp_path: Path) -> None:
     _scand(tmp_path / "in" / "A", 21.0)
     _scand(tmp_path / "in" / "B", 21.0)

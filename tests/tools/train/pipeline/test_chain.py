@@ -108,6 +108,7 @@ def test_imitation_after_a_round_begins_anew_and_keeps_what_was_before(
     assert is_done(run_dir, Step("imitate")) and is_done(run_dir, again)
 
 
+@pytest.mark.slow
 def test_borrowed_drives_are_not_added_to(run_dir: RunDir, tmp_path: Path) -> None:
     other = RunDir.open(tmp_path / "other", TINY)
     run_dir.finish("collect", {})
@@ -127,6 +128,7 @@ def test_a_round_needs_a_policy(run_dir: RunDir) -> None:
 DEAF = ("action.latency_aware", "action.motion_offset")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("to", DEAF)
 def test_an_ablation_of_an_input_starts_from_weights_with_that_input(run_dir: RunDir, tmp_path: Path, to: str) -> None:
     save_weights(build(TINY.model, 7), tmp_path / "w.safetensors", WeightsInfo(True, "elsewhere"))
@@ -143,6 +145,7 @@ def test_an_ablation_of_another_shape_is_refused_as_a_beginning(run_dir: RunDir,
         import_start(run_dir.out, with_overrides(TINY.model, {"action.layers": "2"}), [tmp_path / "w.safetensors"], 1)
 
 
+@pytest.mark.slow
 def test_weights_of_another_language_model_are_refused(run_dir: RunDir) -> None:
     path = finish_network(job(run_dir), "sft", build(TINY.model, 5))
     with pytest.raises(TrainError, match="language differs from the recipe's"):
@@ -232,6 +235,7 @@ def run(*arguments: object) -> int:
     return cli.main([str(argument) for argument in arguments])
 
 
+@pytest.mark.slow
 def test_stages_are_run_one_by_one_into_one_folder(tmp_path: Path, stages: None, capsys: Any) -> None:
     out = tmp_path / "run"
     assert run("collect", "--preset", "tiny", "--out", out, "--json", tmp_path / "r.json") == EXIT_DONE
@@ -274,6 +278,7 @@ def test_invalid_arguments_are_refused_in_one_line(
     assert message in printed and printed.count("\n") == 1 and not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_run_keeps_its_own_copy_of_a_devices_delays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
@@ -390,6 +395,7 @@ def test_weights_that_are_given_away_are_half_the_size_and_the_default_of_their_
     assert shipped_weights(TINY.model, tmp_path / "nothing") is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", [None, b"# Somebody's weights", b"\xff\xfe"])
 def test_weights_without_a_card_are_foreign(run_dir: RunDir, tmp_path: Path, text: bytes | None) -> None:
     if text is not None:

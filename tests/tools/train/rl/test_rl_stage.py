@@ -73,6 +73,7 @@ def _improved(out: Path, config: RlConfig, drive: Any, *, resume: bool = False) 
     return network, improve(job, learner, before, out / "artifacts", drive)
 
 
+@pytest.mark.slow
 def test_every_iteration_is_logged_and_evaluations_in_between(tmp_path: Path) -> None:
     config = RlConfig(iterations=4, evaluate_every=2, warmup_iterations=0, ppo=PPO)
     _, result = _improved(tmp_path, config, _driver(tiny_network(), lambda _: True))
@@ -118,6 +119,7 @@ def test_a_run_that_was_ended_goes_on_exactly(ended: int, tmp_path: Path) -> Non
         assert torch.equal(tensor, parts.state_dict()[name]), name
 
 
+@pytest.mark.slow
 def test_a_policy_that_gets_worse_is_taken_back(tmp_path: Path) -> None:
     config = RlConfig(iterations=2, evaluate_every=2, warmup_iterations=0, ppo=PPO)
     network, result = _improved(tmp_path, config, _driver(tiny_network(), lambda k: k == 0))
@@ -149,6 +151,7 @@ def test_the_best_is_kept_only_if_it_is_ahead_on_fresh_scenarios(
     assert set(result["final"]) == {"start", "best"}
 
 
+@pytest.mark.slow
 def test_evaluation_and_final_scenarios_differ_and_spread_over_layouts(tmp_path: Path) -> None:
     orders: list[RolloutOrder] = []
     driver = _driver(tiny_network(), lambda k: k == 2)
@@ -166,6 +169,7 @@ def test_evaluation_and_final_scenarios_differ_and_spread_over_layouts(tmp_path:
     assert {order.tasks_per_scene for order in evaluated} == {2}
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_other_numbers_is_not_gone_on_from(tmp_path: Path) -> None:
     config = RlConfig(iterations=2, evaluate_every=2, warmup_iterations=0, ppo=PPO)
     _improved(tmp_path, config, _driver(tiny_network(), lambda _: True))
@@ -181,6 +185,7 @@ def test_a_checkpoint_of_other_numbers_is_not_gone_on_from(tmp_path: Path) -> No
         )
 
 
+@pytest.mark.slow
 def test_a_devices_delays_reach_the_workers_with_their_late_frames(tmp_path: Path) -> None:
     profile = LatencyProfile("orin", "measured there", (2.0, 3.0), (0.5, 0.7))
     (tmp_path / "orin.json").write_text(json.dumps(profile.as_json()))

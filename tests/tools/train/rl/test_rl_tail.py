@@ -158,6 +158,7 @@ def test_the_learner_commands_what_the_whole_expert_would(tmp_path: Path) -> Non
             assert torch.allclose(within_limits(learner.arcs(rows), LIMITS)[i], wanted[0], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_an_update_moves_the_tail_and_the_value_and_nothing_else(tmp_path: Path) -> None:
     network = tiny_network()
     before = {name: each.detach().clone() for name, each in network.named_parameters()}
@@ -209,6 +210,7 @@ def test_a_terminal_step_has_no_future_reward_but_a_cut_off_one_has() -> None:
 _M = st.floats(-2.0, 2.0, allow_nan=False)
 
 
+@pytest.mark.slow
 @given(_M, _M, st.floats(-3.0, 3.0))
 def test_the_mean_command_is_the_controllers_own_arc_within_its_limits(x: float, y: float, theta: float) -> None:
     limits = _limits()
@@ -299,6 +301,7 @@ def test_ppo_finds_the_action_that_pays() -> None:
     assert np.mean(seen[-5:]) > np.mean(seen[:5]) + 0.5
 
 
+@pytest.mark.slow
 def test_a_policy_that_has_moved_far_enough_stays_while_the_value_learns_on() -> None:
     def update(target_kl: float) -> tuple[_OneNumber, PpoStats]:
         learner, generator = _one_number(), torch.Generator().manual_seed(0)

@@ -80,6 +80,7 @@ def test_a_damaged_drive_is_refused_and_nothing_taken(run_dir: RunDir, theirs: D
     assert not run_dir.begun("collect")
 
 
+@pytest.mark.slow
 def test_the_card_does_not_call_them_ours(run_dir: RunDir, theirs: Dataset, tmp_path: Path) -> None:
     from export.model.network import build
     from export.model.weights import WeightsInfo, save_weights

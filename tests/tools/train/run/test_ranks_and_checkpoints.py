@@ -33,6 +33,7 @@ def run_dir(tmp_path: Path, **changed: object) -> RunDir:
     return RunDir.open(tmp_path / "run", replace(load_recipe("tiny"), **changed))
 
 
+@pytest.mark.slow
 def test_a_run_records_its_versions(tmp_path: Path) -> None:
     made = run_dir(tmp_path)
     assert load_recipe(str(made.recipe_path)) == load_recipe("tiny")
@@ -40,6 +41,7 @@ def test_a_run_records_its_versions(tmp_path: Path) -> None:
     assert versions["packages"]["numpy"] == np.__version__ and versions["python"]
 
 
+@pytest.mark.slow
 def test_a_run_that_continues_with_other_code_reports_it_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = run_dir(tmp_path)
     first = json.loads((made.out / "versions.json").read_text())
@@ -53,6 +55,7 @@ def test_a_run_that_continues_with_other_code_reports_it_once(tmp_path: Path, mo
     assert versions == first and [each["code_sha256"]["simulation"] for each in later] == ["of tomorrow"]
 
 
+@pytest.mark.slow
 def test_numbers_of_a_stage_may_change_until_it_has_begun(tmp_path: Path) -> None:
     made = run_dir(tmp_path)
     (made.stage("collect") / "drive").touch()
@@ -63,6 +66,7 @@ def test_numbers_of_a_stage_may_change_until_it_has_begun(tmp_path: Path) -> Non
         RunDir.open(made.out, load_recipe("tiny", ["sft.epochs=8"]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("setting", ["seed=5", "model.action.latency_aware=false"])
 def test_seed_and_network_of_a_run_are_fixed_by_its_first_stage(setting: str, tmp_path: Path) -> None:
     made = run_dir(tmp_path)
@@ -99,6 +103,7 @@ def test_a_retired_stages_files_are_kept_under_another_name(tmp_path: Path) -> N
     assert [line["stage"] for line in made.lines()] == ["imitate-0"]
 
 
+@pytest.mark.slow
 def test_another_runs_stages_are_used_where_they_would_be_the_same(tmp_path: Path) -> None:
     base = run_dir(tmp_path)
     for stage in ("collect", "encoder", "sft"):
@@ -305,6 +310,7 @@ def test_weights_are_no_checkpoint(tmp_path: Path) -> None:
         load_checkpoint(tmp_path / "c")
 
 
+@pytest.mark.slow
 def test_a_stage_that_has_not_finished_is_not_lent(tmp_path: Path) -> None:
     base = run_dir(tmp_path)
     with pytest.raises(TrainError, match="sft has not finished"):

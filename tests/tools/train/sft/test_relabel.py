@@ -152,6 +152,7 @@ def test_only_frames_without_people_nearby_are_relabelled(tmp_path: Path) -> Non
     assert relabels.anchors(crowded) == []
 
 
+@pytest.mark.slow
 def test_a_drive_without_traces_or_from_elsewhere_is_left_alone(tmp_path: Path) -> None:
     scenario, drive, _ = _told("corridor")
     elsewhere = replace(drive, about=replace(drive.about, scene="corridor-0"))

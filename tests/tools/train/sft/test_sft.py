@@ -66,6 +66,7 @@ def test_the_loss_falls_on_training_and_held_out_data(tmp_path: Path, dataset: D
     assert held[-1] < 0.7 * held[0]
 
 
+@pytest.mark.slow
 class TestStage(StageContract):
     rank = "tests.support.train.train_sft_rank"
     other = dataclasses.replace(CONFIG, batch=7)
@@ -87,6 +88,7 @@ def test_drives_without_traces_cannot_be_learned_from(tmp_path: Path) -> None:
         trained(silent, sft_job(tmp_path))
 
 
+@pytest.mark.slow
 def test_the_stage_reads_the_runs_drives_and_leaves_the_runs_network(tmp_path: Path) -> None:
     small_dataset(tmp_path / "collect")
     few = dataclasses.replace(CONFIG.evaluate, anchors=2, epoch_anchors=1, drives=1, max_new_tokens=3)
