@@ -68,7 +68,7 @@ class Deviation:
         return since_s >= 0.0 and (self.back_s is None or since_s < self.back_s)
 
 
-class TrueTexts:
+class RouteTexts:
     """Writes the text that is true at a pose of one scenario, without people."""
 
     def __init__(self, scenario: Scenario) -> None:
@@ -90,7 +90,7 @@ class TrueTexts:
 
 def instants_of(log: Mapping[str, Any], scenario: Scenario) -> list[Instant]:
     """Return the generations of an episode's log (`read_log`), in order."""
-    columns, texts = log["columns"], TrueTexts(scenario)
+    columns, texts = log["columns"], RouteTexts(scenario)
     times = np.array(columns["time_s"], np.float64)
     x, y = (np.array(columns[name], np.float64) for name in ("odom_x_m", "odom_y_m"))
     driven = np.concatenate(((0.0,), np.cumsum(np.hypot(np.diff(x), np.diff(y)))))

@@ -86,7 +86,7 @@ def test_errors_are_listed_by_age_and_add_up(samples: Samples) -> None:
 
 def test_another_drives_states_increase_the_error(samples: Samples) -> None:
     def by_words(batch: ActionBatch) -> torch.Tensor:
-        """Goes to the side that it is told; what it is told of its own drive is always right."""
+        """Drives to the side that the text names; its own drives always have the right text."""
         side = torch.sign(batch.guidance[:, -1, 0]).repeat_interleave(len(batch) // len(batch.guidance))
         true = batch.target.clone()
         true[..., 1:] = true[..., 1:].abs() * side[:, None, None]

@@ -264,7 +264,7 @@ def test_two_processes_share_the_stages_that_can_be_shared_and_the_first_does_th
     steps = ["collect", "encoder", "sft", "imitate", "dagger", "sft", "imitate", "rl", "evaluate"]
     shared = {"encoder", "sft", "imitate"}
     done = [(tmp_path / f"{rank}.txt").read_text().splitlines() for rank in range(2)]
-    # Whoever works alone has the threads of both.
+    # A rank that works alone has the threads of both ranks.
     assert done[0] == [f"{step} 0/2 1" if step in shared else f"{step} 0/1 2" for step in steps]
     assert done[1] == [f"{step} 1/2 1" for step in steps if step in shared]
     assert (tmp_path / "run" / "imitate-0").is_dir() and (tmp_path / "run" / "evaluate" / "result.json").is_file()
