@@ -57,6 +57,7 @@ def figures(episodes: Sequence[Sequence[Instant]]) -> dict[str, Any]:
         "instants": len(every),
         "lost": lost,
         "true_back": sum(each.true_back for each in every),
+        "back_recall_where_true": _share([each.says_back for each in every if each.true_back]),
         "progress_right_on_route": _share([each.true_progress for each in every if not each.lost]),
         "progress_right_lost": _share([each.true_progress for each in every if each.lost]),
         "back_recall": right / lost if lost else None,
@@ -82,8 +83,10 @@ def markdown(content: Mapping[str, Any]) -> str:
         "lost at": f"{content['lost']} generations",
         "progress right: on the route, lost": f"{_percent(content['progress_right_on_route'])}, "
         f"{_percent(content['progress_right_lost'])}",
-        'the text says "turn back": of those lost, of those that say so': f"{_percent(content['back_recall'])}, "
-        f"{_percent(content['back_precision'])}",
+        'the text says "turn back": of those lost': _percent(content["back_recall"]),
+        "the same of those where the true text says so": f"{_percent(content['back_recall_where_true'])} of "
+        f"{content['true_back']}",
+        "the robot is lost: of those that say so": _percent(content["back_precision"]),
         "deviations; noticed by the text, after (median)": f"{content['deviations']}; {content['noticed']}, "
         f"{_seconds(content['noticed_s_median'])}",
         "came back to the route, after (median)": f"{content['returned']}, {_seconds(content['back_s_median'])}",

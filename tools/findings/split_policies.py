@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from math import hypot
 from types import MappingProxyType
 from typing import Final
 
@@ -50,7 +51,7 @@ from sim_hil.scene.nav_grid import NavGrid
 from tools.train.config.collect import RATE_HZ, CollectConfig
 from tools.train.drives.futures import chosen_future
 from tools.train.drives.scenarios import Scenario
-from tools.train.drives.traces import Tracer
+from tools.train.drives.traces import Tracer, turning_first
 
 Array = NDArray[np.float64]
 Velocity = tuple[float, float, float]
@@ -171,7 +172,7 @@ class TrueTexts:
     """Writes the true text of each instant, with the waypoints of the teacher, as training's drives have them."""
 
     def __init__(self, scenario: Scenario) -> None:
-        self._scenario, self._tracer = scenario, Tracer(scenario)
+        self._tracer, self._turn_radps = Tracer(scenario), driving_of(scenario.episode.robot).turn_radps
         self._expert = ExpertPolicy(
             margin_m=_STEER.margin_m, speed_mps=_STEER.speed_mps, prescribed=scenario.task.path, patient=True,
             rests=True, wall_m=_STEER.wall_m,
@@ -193,9 +194,11 @@ class TrueTexts:
         assert choice is not None
         pose = world.pose()
         chosen = chosen_future(pose, choice, self._expert.route())
-        means = [tuple(float(value) for value in chosen[_PLAN_STEP, :2])]
-        found = self._tracer.trace(pose, world.people(), world.people_velocities(), means)
-        return replace(found, waypoints=tuple(self._expert.plan()))
+        plan = self._expert.plan()
+        means = [turning_first(plan[0], self._turn_radps, _STEER.speed_mps)]
+        driven_m = hypot(*(float(value) for value in chosen[_PLAN_STEP, :2]))
+        found = self._tracer.trace(pose, world.people(), world.people_velocities(), means, driven_m)
+        return replace(found, waypoints=tuple(plan))
 
 
 class _TruthfulLanguage(LanguageModel):

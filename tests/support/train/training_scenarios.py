@@ -56,7 +56,8 @@ def drive_along(scenario: Scenario, drive_id: str = "a", *, motion: str = NO_PEO
     poses = _poses_along(scenario)
     tracer, traces = Tracer(scenario, progress_of(scenario)), []
     for k in range(0, len(poses), 10):
-        said = aspects_json(tracer.trace(SE2(*map(float, poses[k])), *_NO_PEOPLE, [(2.4, 0.0)]))
+        pose = SE2(*map(float, poses[k]))
+        said = {**aspects_json(tracer.trace(pose, *_NO_PEOPLE, [(2.4, 0.0)])), "off_m": tracer.off_m(pose)}
         things = said["objects"] if motion == NO_PEOPLE else NO_OBJECTS  # for both there is no room
         traces.append({"k": k, **said, "objects": things, "motion": motion})
     plain = made_up_drive(

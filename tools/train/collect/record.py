@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import hypot
 from typing import Any, Final
@@ -11,20 +11,24 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.core.geometry import SE2
 from sim_hil.benchmark.env.observation import Observation
 from sim_hil.benchmark.env.world import EpisodeWorld, WorldOptions
 from sim_hil.benchmark.policies.expert import ExpertPolicy
 from sim_hil.benchmark.suite.episode import Episode
-from sim_hil.scene.scene import Scene
+from sim_hil.scene.scene import Scene, Vec2
 from tools.train.collect.steering import Detour, DetourDriver, Velocity
 from tools.train.config.collect import RATE_HZ, TRACE_EVERY
-from tools.train.drives.drive import NOISE, PICTURE_PX, PLAN_TIMES_S
+from tools.train.drives.drive import EXPERT, NOISE, PICTURE_PX, PLAN_TIMES_S
 from tools.train.drives.futures import chosen_future, label_futures
 
 Steer = Callable[[Observation, Velocity], tuple[Velocity, int]]
 """Maps (observation, the expert's command) to (command, its source: EXPERT, NOISE or POLICY)."""
-TraceAt = Callable[[EpisodeWorld, NDArray[np.float64]], Mapping[str, Any]]
-"""Maps (world, the expert's chosen future [50, 3]) to the trace of this instant; called once a second."""
+TraceAt = Callable[[EpisodeWorld, NDArray[np.float64], Sequence[Vec2]], Mapping[str, Any]]
+"""Maps (world, the expert's chosen future [50, 3], positions on its route in 3, 6 and 9 s) to the trace of an instant.
+
+Called once a second.
+"""
 
 LEAST_FRAMES: Final = 30
 """Shortest usable drive, frames."""
@@ -34,7 +38,8 @@ _EXPERT_STUCK_S: Final = 40.0  # longer than the policy's, because the expert wa
 _STUCK_M: Final = 0.5  # the robot is stuck if it stays within this distance for that time
 GLIDE_HZ: Final = 120
 """Steps a second of a world whose robot glides: the least that `Simulation` takes."""
-_OFF_M: Final = 6.0  # a policy's drive ends at this distance from the route
+_OFF_M: Final = 20.0  # a policy's drive ends at this distance from the route
+_RESCUED_M: Final = (6.0, 1.0)  # distances from the route at which the expert takes over, and gives back to a policy
 
 
 class NothingToLearnError(Exception):
@@ -80,9 +85,10 @@ class DrivePlan:
     """One drive to record: episode, scene, cameras and conditions.
 
     `path` [n, 2]: the described route, m. With `policy_drives` a policy commands: its mistakes are recorded, until it
-    is 6 m off the route or stuck for 15 s. The expert's drives end before a collision or fall; those farther than
-    `off_m` from the route are rejected, because the instruction would not describe them. `linger_s`: recording after
-    arrival, s. `detour`: temporary departure from the route, if it is possible. `legs`: as CollectConfig.legs.
+    is stuck for 15 s. From 6 m off the route the expert drives it back. The expert's drives end before a collision or
+    fall; those farther than `off_m` from the route are rejected, because the instruction would not describe them.
+    `linger_s`: recording after arrival, s. `detour`: temporary departure from the route, if it is possible. `legs`: as
+    CollectConfig.legs.
     """
 
     episode: Episode
@@ -108,6 +114,7 @@ def record(plan: DrivePlan, expert: ExpertPolicy, steer: Steer, trace_at: TraceA
         glides=not plan.legs,
     )
     first_collision: int | None = None
+    rescue = Rescue(plan)
     with EpisodeWorld(plan.episode, options, scene=plan.scene) as world:
         try:
             expert.reset(plan.episode, plan.episode.instructions[0], world, plan.episode.seed)
@@ -119,11 +126,13 @@ def record(plan: DrivePlan, expert: ExpertPolicy, steer: Steer, trace_at: TraceA
                 observation = _shrunk(world.observe())
                 wanted = expert.act(observation)
                 command, by = steer(observation, wanted)
+                if rescue.is_needed(world.pose()):
+                    command, by = wanted, EXPERT
                 if detour is not None and (departing := detour.command(observation)) is not None:
                     command, by = departing, NOISE
                 _keep(frames, plan, world, observation, expert, by)
                 if len(frames.traces) * TRACE_EVERY < len(frames.pose):
-                    frames.traces.append(trace_at(world, frames.chosen[-1]))
+                    frames.traces.append(trace_at(world, frames.chosen[-1], frames.plan_xy[-1]))
                 world.step(command)
                 if first_collision is None and world.collided:
                     first_collision = len(frames.pose)
@@ -136,6 +145,21 @@ def record(plan: DrivePlan, expert: ExpertPolicy, steer: Steer, trace_at: TraceA
         end, collided = world.end, world.collided
     outcome = "cut" if end == "stopped" else str(end)
     return _finish(frames, plan, outcome, collided, first_collision)
+
+
+class Rescue:
+    """Tells whether the expert drives a policy's robot back to the route."""
+
+    def __init__(self, plan: DrivePlan) -> None:
+        self._plan, self._active = plan, False
+
+    def is_needed(self, pose: SE2) -> bool:
+        """Return whether the expert drives now; call it once per frame."""
+        if self._plan.policy_drives:
+            far_m, near_m = _RESCUED_M
+            off_m = off_way_m(np.array((pose.x_m, pose.y_m)), self._plan.path)
+            self._active = off_m > (near_m if self._active else far_m)
+        return self._active
 
 
 def _detour_driver(plan: DrivePlan, world: EpisodeWorld, expert: ExpertPolicy) -> DetourDriver | None:
@@ -175,7 +199,7 @@ def _keep(
 
 
 def is_hopeless(pose: NDArray[np.float64], plan: DrivePlan) -> bool:
-    """Return whether to end a drive: stuck within 0.5 m, or a policy is 6 m off the route. `pose` [N, 3] so far."""
+    """Return whether to end a drive: stuck within 0.5 m, or a policy is 20 m off the route. `pose` [N, 3] so far."""
     if plan.policy_drives and off_way_m(pose[-1, :2], plan.path) > _OFF_M:
         return True
     frames = round((_POLICY_STUCK_S if plan.policy_drives else _EXPERT_STUCK_S) * RATE_HZ)

@@ -15,6 +15,7 @@ import numpy as np
 
 from edge.artifacts.files import ArtifactError
 from edge.core.geometry import SE2
+from edge.state.reasoning_text import Progress, parse_progress
 from sim_hil.benchmark.conditions.latency import LatencyProfile
 from sim_hil.benchmark.env.observation import Observation
 from sim_hil.benchmark.env.world import EpisodeWorld
@@ -153,6 +154,10 @@ class PolicyDriver:
         The policy processes every frame.
         """
         return self._shared.command(wanted, self._policy.act(observation))
+
+    def progress(self) -> Progress | None:
+        """Return the progress of the newest text: the one that the next generation's prompt has; None before it."""
+        return parse_progress(str(self._policy.notes().get("text", "")))
 
     def __enter__(self) -> PolicyDriver:
         return self

@@ -308,7 +308,8 @@ class _Tour:
         """Return the true reasoning text of this instant."""
         means = [turning_first(self.plan[0], self._driving.turn_radps, self._speed_mps)]
         people, velocities = self._world.people(), self._world.velocities()
-        return aspects_json(self._tracer.trace(self.body.pose, people, velocities, means))
+        text = self._tracer.trace(self.body.pose, people, velocities, means)
+        return {**aspects_json(text), "off_m": self._tracer.off_m(self.body.pose)}
 
     def step(self) -> None:
         """Advance robot and people by 0.1 s."""

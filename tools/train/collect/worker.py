@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
+from math import hypot
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,10 +21,10 @@ from edge.reasoning.prompt import InstructionError
 from export.core.typed import build
 from sim_hil.benchmark.env.observation import Observation
 from sim_hil.benchmark.env.world import EpisodeWorld
-from sim_hil.benchmark.policies.expert import ExpertPolicy
+from sim_hil.benchmark.policies.expert import ExpertPolicy, driving_of
 from sim_hil.benchmark.workers.worker_process import worker_main
 from sim_hil.processes.child_process import Message
-from sim_hil.scene.scene import SceneError
+from sim_hil.scene.scene import SceneError, Vec2
 from tools.train.collect.record import (
     CameraSettings,
     DrivePlan,
@@ -38,7 +39,7 @@ from tools.train.config.collect import RATE_HZ, SHARES, TRACE_EVERY, CollectConf
 from tools.train.drives.drive import DRIVES, EXPERT, PICTURE_PX, TOUR_DRIVER, About, Drive, Entry
 from tools.train.drives.scenarios import Scenario, ScenarioError, training_episodes
 from tools.train.drives.trace_sentences import aspects_json
-from tools.train.drives.traces import Tracer
+from tools.train.drives.traces import Tracer, turning_first
 
 MODULE: Final = "tools.train.collect.worker"
 _TAG: Final = 0xC011
@@ -175,14 +176,15 @@ def _drive(order: Order, number: int, scenario: Scenario) -> Entry:
     )
     if order.policy is not None:
         with PolicyDriver(order.policy, episode, rng) as policy:
-            recorded, driver = record(plan, expert, policy.steer, _trace_at(scenario)), policy.name
+            trace_at = _trace_at(scenario, config.speed_mps, policy)
+            recorded, driver = record(plan, expert, policy.steer, trace_at), policy.name
     else:
         noise = SteeringNoise(rng) if draw.noise else None
 
         def steer(_: Observation, wanted: Velocity) -> tuple[Velocity, int]:
             return (wanted, EXPERT) if noise is None else noise.command(wanted)
 
-        recorded = record(plan, expert, steer, _trace_at(scenario))
+        recorded = record(plan, expert, steer, _trace_at(scenario, config.speed_mps))
         driver = "expert-noise" if draw.noise else "expert"
     return _saved(order, Drive(_about(scenario, order.id(number), recorded, driver, draw), **recorded.arrays))
 
@@ -207,12 +209,17 @@ def _saved(order: Order, drive: Drive) -> Entry:
     return Entry.of(drive, path)
 
 
-def _trace_at(scenario: Scenario) -> TraceAt:
-    tracer = Tracer(scenario)
+def _trace_at(scenario: Scenario, speed_mps: float, policy: PolicyDriver | None = None) -> TraceAt:
+    tracer, driving = Tracer(scenario), driving_of(scenario.episode.robot)
 
-    def trace_at(world: EpisodeWorld, chosen: NDArray[np.float64]) -> Mapping[str, Any]:
-        means = [tuple(float(v) for v in chosen[_PLAN_STEP, :2])]
-        return aspects_json(tracer.trace(world.pose(), world.people(), world.people_velocities(), means))
+    def trace_at(world: EpisodeWorld, chosen: NDArray[np.float64], plan_xy: Sequence[Vec2]) -> Mapping[str, Any]:
+        # Whether to turn back is the route's matter; stepping back from a person is not turning back.
+        means = [turning_first(plan_xy[0], driving.turn_radps, speed_mps)]
+        driven_m = hypot(*(float(v) for v in chosen[_PLAN_STEP, :2]))
+        text = tracer.trace(world.pose(), world.people(), world.people_velocities(), means, driven_m)
+        said = None if policy is None else policy.progress()
+        believed = {} if said is None else {"believed": asdict(said)}
+        return {**aspects_json(text), "off_m": tracer.off_m(world.pose()), **believed}
 
     return trace_at
 

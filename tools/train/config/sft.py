@@ -27,9 +27,11 @@ class DrawConfig(Checked):
     """Share of generations that take longer, and their upper limit, s."""
     before_wrong: Fraction = 0.25
     """Share of prompts with wrong previous progress, so that the model learns to correct mistakes."""
-    before_ahead_off_route: Share = 0.0
-    """The same of frames off the route whose true plan is to turn back: the previous progress counts the missed turn as
-    done, as a robot has it that took a wrong opening and does not know it."""
+    before_unaware: Share = 0.5
+    """Share of the prompts of frames off the route whose previous progress is that of a robot that does not know it: it
+    counts the missed turn as done, or has not counted the opening that it missed."""
+    before_own: Share = 0.7
+    """Share of the prompts of a policy's drives whose previous progress is that of its own text."""
     way_turn_rad: Deviation = 0.035
     way_scale: Deviation = 0.02
     way_point_m: Deviation = 0.05

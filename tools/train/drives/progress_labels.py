@@ -25,7 +25,7 @@ from tools.train.drives.scenarios import Scenario
 Array = NDArray[np.float64]
 
 _SPACING_M: Final = 0.1  # distance between two points of a route
-_REACH_M: Final = 15.0  # longest walking distance to the route that is computed exactly
+_REACH_M: Final = 25.0  # longest walking distance to the route that is computed exactly
 _TURNED_M: Final = 1.0  # within this distance past a turn, a robot still in the old corridor has not turned
 _BEYOND_M: Final = 0.3  # distance past an opening at which it counts as missed
 _ASIDE_M: Final = 2.0  # largest lateral distance from the turn at which a robot has driven straight past it
@@ -74,7 +74,7 @@ class RouteProgress:
         return (len(self._points) - 1 - self._place(pose)) * _SPACING_M + self._strayed(pose)
 
     def strayed_m(self, pose: SE2) -> float:
-        """Return the walking distance to the route, m; approximate beyond 15 m."""
+        """Return the walking distance to the route, m; approximate beyond 25 m."""
         row, column = self._grid.cell(pose.x_m, pose.y_m)
         return float(self._gap_m[row, column])
 

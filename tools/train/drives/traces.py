@@ -58,6 +58,7 @@ _WAIT_FOR_M: Final = 2.5  # the robot waits only for a person within this distan
 _INSIDE_M: Final = 0.2  # depth inside an opening of the point whose visibility is tested
 _BACK_M: Final = -0.3  # a planned x in 3 s below this counts as turning back
 _ROUND_RAD: Final = 2.0  # the expert usually turns around for targets beyond this bearing
+_AGAINST: Final = -0.5  # cosine between a heading and a leg's direction below which the robot drives the leg backwards
 _HERE_M: Final = 0.05  # a planned position within this distance means staying
 _ON_M: Final = 2.0  # x in 3 s that is assumed without a plan: the robot drives on
 _EYES_M: Final = {"go2": EYE_M, "carter": MOUNTS["carter"].position_m[2]}  # camera height; the Go2's while standing
@@ -104,23 +105,27 @@ class Tracer:
         self._others = [thing for thing in self._scene.landmarks() if thing is not self._goal]
 
     def trace(
-        self, pose: SE2, people: Array, velocities: Array, plan_xy: Sequence[Sequence[float]] | None = None
+        self, pose: SE2, people: Array, velocities: Array, plan_xy: Sequence[Sequence[float]] | None = None,
+        driven_m: float | None = None,
     ) -> ReasoningText:  # fmt: skip
         """Describe the scene at a true pose among people [n, 2 or 3] (x m, y m, ...) with world velocities [n, 2], m/s.
 
-        `plan_xy`: planned positions in 3 s (and later), m in the robot frame; without them waiting is not detected.
+        `plan_xy`: planned positions in 3 s (and later), m in the robot frame (see `turning_first`); without them
+        waiting is not detected. `driven_m`: distance to where the driver means to be in 3 s, if the plan's is another.
         """
         crowd = self._people_in_view(pose, people)
         progress, step = self.progress.at(pose), self.progress.next_step(pose)
         left_m = self.progress.to_next_m(pose)
         ahead = any(gap < _WAIT_FOR_M and _side(pose, people[index]) == AHEAD for index, gap in crowd)
+        x_m, y_m = (_ON_M, 0.0) if plan_xy is None else plan_xy[0][:2]
+        missed = step is not None and 0 < step.ordinal <= progress.passed
+        backwards = step is not None and _drives_backwards(pose, step, missed=missed)
         plan = Plan(Stop(plan_metres(left_m)))
         if step is not None:
-            plan = Plan(Turn(AHEAD if step.side == "straight" else step.side, step.kind, plan_metres(left_m)))
-        x_m, y_m = (_ON_M, 0.0) if plan_xy is None else plan_xy[0][:2]
-        if (step is not None and 0 < step.ordinal <= progress.passed) or x_m < _BACK_M:
+            plan = Plan(Turn(_seen_side(step, backwards=backwards), step.kind, plan_metres(left_m)))
+        if x_m < _BACK_M or (missed and not backwards):
             plan = Plan(TurnBack())
-        elif ahead and hypot(x_m, y_m) < _WAIT_M:
+        elif ahead and (hypot(x_m, y_m) if driven_m is None else driven_m) < _WAIT_M:
             plan = replace(plan, waits=True)
         near = [
             SeenPerson(_side(pose, people[index]), whole_metres(gap), _motion(pose, people[index], velocities[index]))
@@ -130,7 +135,12 @@ class Tracer:
         area = self._scene.area_at(pose.x_m, pose.y_m)
         kind = area.kind if area is not None and area.kind in AREAS else OPEN_AREA
         situation = Situation(kind, sum(len(crowd) >= least for least in _MANY))
-        return five_aspects(situation, self._objects(pose, step, bodies), near, progress, plan)
+        objects = self._objects(pose, step, bodies, backwards=backwards)
+        return five_aspects(situation, objects, near, progress, plan)
+
+    def off_m(self, pose: SE2) -> float:
+        """Return the walking distance to the route, m, rounded as a drive's header has it."""
+        return round(self.progress.strayed_m(pose), 1)
 
     def _people_in_view(self, pose: SE2, people: Array) -> list[tuple[int, float]]:
         """Return indices and distances, m, of people in view within PEOPLE_M, nearest first."""
@@ -171,10 +181,12 @@ class Tracer:
         dx, dy = thing.position_m[0] - x, thing.position_m[1] - y
         return abs(dy * c - dx * s) <= tan(HFOV_RAD / 2) * (dx * c + dy * s) + margin_m
 
-    def _objects(self, pose: SE2, step: Step | None, bodies: Sequence[SceneObject]) -> list[SeenObject]:
+    def _objects(
+        self, pose: SE2, step: Step | None, bodies: Sequence[SceneObject], *, backwards: bool
+    ) -> list[SeenObject]:  # fmt: skip
         """The goal, the next opening that counts, landmarks that the instruction names, then the nearest landmarks."""
         found = [self._object(pose, self._goal)] if self._seen(pose, self._goal, bodies) else []
-        if step is not None and (opening := self._next_opening(pose, step)) is not None:
+        if step is not None and (opening := self._next_opening(pose, step, backwards=backwards)) is not None:
             found.append(opening)
         for thing in sorted(self._others, key=lambda thing: (thing.label not in self._named, _gap(pose, thing))):
             if len(found) == MAX_OBJECTS:
@@ -187,12 +199,15 @@ class Tracer:
     def _object(pose: SE2, thing: SceneObject) -> SeenObject:
         return SeenObject(thing.landmark, _side(pose, thing.position_m), whole_metres(_gap(pose, thing)))
 
-    def _next_opening(self, pose: SE2, step: Step) -> SeenObject | None:
-        """The nearest opening ahead that counts for a step and is in view; None without any."""
+    def _next_opening(self, pose: SE2, step: Step, *, backwards: bool) -> SeenObject | None:
+        """The nearest opening ahead that counts for a step and is in view; None without any.
+
+        `backwards`: the robot comes back to the opening that it has missed.
+        """
         frame, xy = Frame(step.ahead), (pose.x_m, pose.y_m)
         here = frame.along(xy)
-        for opening in step.counted:
-            if opening.middle_m <= here:
+        for opening in (step.counted[step.ordinal - 1],) if backwards else step.counted:
+            if opening.middle_m <= here and not backwards:
                 continue
             left = opening.side == "left"
             across = self._border(frame, xy, opening) + (_INSIDE_M if left else -_INSIDE_M)
@@ -200,8 +215,7 @@ class Tracer:
             # Close to the wall, the opening's far end is visible first.
             if self._in_sight(pose, point) or self._in_sight(pose, frame.point(opening.high_m - _INSIDE_M, across)):
                 # Along the corridor its side is the one on which it counts, however small the angle.
-                along = cos(pose.theta_rad) * step.ahead[0] + sin(pose.theta_rad) * step.ahead[1] > _ALONG
-                side = opening.side if along else _side(pose, point)
+                side = opening.side if _along(pose, step) > _ALONG else _side(pose, point)
                 metres = hypot(point[0] - pose.x_m, point[1] - pose.y_m)
                 return SeenObject(opening_name(opening.area.kind), side, whole_metres(metres))
         return None
@@ -220,6 +234,23 @@ class Tracer:
         """Return whether a post of table height would be visible at a point."""
         post = SceneObject("post", "column", (*point, 0.0), 0.0, (0.1, 0.1, 0.8), (0.0, 0.0, 0.0), "")
         return self._pixels(pose, post) > 0
+
+
+def _along(pose: SE2, step: Step) -> float:
+    """Return the cosine between the robot's heading and the direction of the leg that ends with a step."""
+    return cos(pose.theta_rad) * step.ahead[0] + sin(pose.theta_rad) * step.ahead[1]
+
+
+def _drives_backwards(pose: SE2, step: Step, *, missed: bool) -> bool:
+    """Return whether the robot comes back along the leg to a counted opening that it has driven past (`missed`)."""
+    return step.ordinal > 0 and _along(pose, step) < (0.0 if missed else _AGAINST)
+
+
+def _seen_side(step: Step, *, backwards: bool) -> str:
+    """Return the side of a step's turn for a robot that drives its leg forwards or backwards."""
+    if step.side == "straight":
+        return AHEAD
+    return (RIGHT if step.side == LEFT else LEFT) if backwards else step.side
 
 
 def _gap(pose: SE2, thing: SceneObject) -> float:

@@ -46,6 +46,8 @@ _NS: Final = 1_000_000_000
 _NEAR: Final = 3  # traces before and after an anchor in which a change of progress makes it a deciding one
 _AHEAD_SHARE: Final = 0.5  # share of wrong progress that is ahead of the truth
 _STALE_S: Final = 20.0  # largest age of stale progress
+OFF_ROUTE_M: Final = 2.0
+"""Walking distance to the route beyond which the robot has left it, m."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,7 @@ class Anchor:
     earlier: tuple[Progress, ...]
     """Progress at every second from the drive's start to k."""
     decides: bool = False
-    """Whether the progress changes within 3 s or the robot must turn back: the previous answer cannot be repeated."""
+    """Whether the progress changes within 3 s or the robot is off its route: the previous answer cannot be repeated."""
     around: tuple[Waypoints | None, ...] = ()
     """`points` of the frames k - AROUND to k + AROUND; None for frames outside the drive."""
     moved: tuple[SE2 | None, ...] = ()
@@ -76,6 +78,10 @@ class Anchor:
     """Whether the robot has stood here since the instruction, for one generation or more."""
     by_seconds: bool = False
     """Whether the drive has images at whole seconds alone."""
+    off_m: float = 0.0
+    """Walking distance to the route, m; 0 if it was not recorded."""
+    believed: Progress | None = None
+    """Progress of the policy's newest text at k; None where no policy drives or it has no text yet."""
 
     def before(self, ago_s: float) -> Progress | None:
         """Return the true progress of a generation whose newest frame is `ago_s` old; None before the drive began."""
@@ -83,6 +89,11 @@ class Anchor:
             return self.progress
         at = int(np.floor((self.k - ago_s * RATE_HZ) / TRACE_EVERY))
         return self.earlier[at] if at >= 0 else None
+
+    @property
+    def off_route(self) -> bool:
+        """Whether the robot has left its route."""
+        return self.off_m > OFF_ROUTE_M or turns_back(self.reasoning)
 
 
 @dataclass(frozen=True)
@@ -129,6 +140,8 @@ def anchors_of(drive: Drive, every: int = TRACE_EVERY) -> list[Anchor]:
         near = [i if 0 <= i < len(drive) else None for i in range(k - AROUND, k + AROUND + 1)]
         T_odom_base = drive.T_odom_base(k)
         points, reasoning = _points(drive, k), aspects_of_json(trace)
+        off_m, believed = float(trace.get("off_m", 0.0)), trace.get("believed")
+        changes = labels[max(0, number - _NEAR)] != labels[min(number + _NEAR, last)]
         found.append(
             Anchor(
                 drive_id=drive.id,
@@ -142,7 +155,9 @@ def anchors_of(drive: Drive, every: int = TRACE_EVERY) -> list[Anchor]:
                 earlier=tuple(earlier),
                 around=tuple(None if i is None else _points(drive, i) for i in near),
                 moved=tuple(None if i is None else _from(drive.T_odom_base(i), T_odom_base) for i in near),
-                decides=turns_back(reasoning) or labels[max(0, number - _NEAR)] != labels[min(number + _NEAR, last)],
+                decides=changes or off_m > OFF_ROUTE_M or turns_back(reasoning),
+                off_m=off_m,
+                believed=None if believed is None else Progress(**believed),
             )
         )
     return found
@@ -168,16 +183,18 @@ def waiting(anchor: Anchor, generations: int) -> Anchor:
 
 def draw(anchor: Anchor, config: DrawConfig, rng: np.random.Generator) -> Drawn:
     """Draw a sample of an anchor; the number of draws from `rng` is always the same."""
-    wording, ago, late, wrong, ahead, which, old, only = rng.uniform(size=8)
+    wording, ago, late, wrong, ahead, which, old, only, own = rng.uniform(size=9)
     noise = rng.standard_normal((2 + MAX_POINTS, 2))
     lowest, highest = config.before_min_s, config.before_max_s
     if late < config.before_late:
         lowest, highest = highest, config.before_latest_s
     ago_s = lowest + ago * (highest - lowest)
     before = anchor.before(ago_s)
-    missed = too_far(before) if before is not None and turns_back(anchor.reasoning) else []
-    if missed and wrong < config.before_ahead_off_route:
-        before = missed[0]
+    unaware = believed_off_route(before) if before is not None and anchor.off_route else []
+    if anchor.believed is not None and own < config.before_own:
+        before = anchor.believed
+    elif unaware and wrong < config.before_unaware:
+        before = unaware[int(which * len(unaware))]
     elif wrong < config.before_wrong and before is not None:
         # Drives do not contain progress that is ahead of the truth, so it is added here.
         others: Sequence[Progress | None] = too_far(before) if ahead < _AHEAD_SHARE else ()
@@ -209,6 +226,19 @@ def _tenth(value_m: float) -> float:
 def turns_back(text: ReasoningText) -> bool:
     """Return whether the plan is to turn back: the robot has left its route."""
     return text.plan is not None and isinstance(text.plan.action, TurnBack)
+
+
+def believed_off_route(progress: Progress) -> list[Progress]:
+    """Return what a robot off its route may believe that does not know it, the true progress given.
+
+    In a wrong opening it believes that it made the turn, and may have counted on from there; past the right opening it
+    believes that this one is still ahead.
+    """
+    step, steps, passed = progress.step, progress.steps, progress.passed
+    if progress.is_last_leg:
+        return []
+    turned = [Progress(step + 1, steps, count) for count in range(1 if step == steps else 2)]
+    return [*turned, *([Progress(step, steps, passed - 1)] if passed > 0 else [])]
 
 
 def too_far(progress: Progress) -> list[Progress]:

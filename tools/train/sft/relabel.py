@@ -44,7 +44,7 @@ from tools.train.run.job import QuietProgress, StageProgress
 from tools.train.samples.anchors import Anchor, anchors_of
 
 FOLDER: Final = "retold"
-FORMAT: Final = 2
+FORMAT: Final = 3
 LEAST_FRAMES: Final = 50
 """Shortest useful relabel, frames."""
 _APART_M: Final = 2.0  # smallest distance between two goals
@@ -237,8 +237,10 @@ def relabel_along(
         if k >= count:
             break
         means = [turning_first((float(plan[k, 0, 0]), float(plan[k, 0, 1])), driving.turn_radps, speed_mps)]
-        alone = tracer.trace(drive.T_world_base(k), np.zeros((0, 2)), np.zeros((0, 2)), means)
-        traces.append({"k": k, **aspects_json(_with_people(alone, aspects_of_json(own)))})
+        pose = drive.T_world_base(k)
+        alone = tracer.trace(pose, np.zeros((0, 2)), np.zeros((0, 2)), means)
+        text = _with_people(alone, aspects_of_json(own))
+        traces.append({"k": k, **aspects_json(text), "off_m": tracer.off_m(pose)})
     steps = tuple(scenario.steps_json())
     return InstructionRelabel(scenario.wordings, steps, scenario.episode.goal_xy, plan, tuple(traces))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from sim_hil.benchmark.env.observation import Observation
 from sim_hil.benchmark.env.world import EpisodeWorld
 from sim_hil.benchmark.policies.artifacts_policy import ArtifactsPolicy
 from sim_hil.benchmark.policies.expert import ExpertPolicy
-from sim_hil.scene.scene import load_scene
+from sim_hil.scene.scene import Vec2, load_scene
 from tests.support.benchmark.benchmark_episodes import corridor_episode
 from tests.support.train.train_drives import dataset, drive
 from tools.train.collect import collection
@@ -48,7 +48,7 @@ def _options(artifacts: Artifacts, beta: float) -> PolicyOptions:
     return PolicyOptions(str(artifacts.directory), artifacts.manifest_sha256, beta, 0.25)
 
 
-def _nothing(_: EpisodeWorld, chosen: NDArray[np.float64]) -> Mapping[str, Any]:
+def _nothing(_: EpisodeWorld, chosen: NDArray[np.float64], plan_xy: Sequence[Vec2]) -> Mapping[str, Any]:
     return {}
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,13 +13,14 @@ from edge.core.geometry import SE2
 from sim_hil.benchmark.env.observation import Observation
 from sim_hil.benchmark.env.world import EpisodeWorld
 from sim_hil.benchmark.policies.expert import ExpertPolicy
-from sim_hil.scene.scene import load_scene
+from sim_hil.scene.scene import Vec2, load_scene
 from tests.support.benchmark.benchmark_episodes import corridor_episode
 from tools.train.collect.record import (
     CameraSettings,
     DrivePlan,
     NothingToLearnError,
     Recorded,
+    Rescue,
     Steer,
     is_hopeless,
     kept_frames,
@@ -40,7 +41,7 @@ def _still(_: Observation, wanted: Velocity) -> tuple[Velocity, int]:
     return (0.0, 0.0, 0.0), POLICY
 
 
-def _tell(world: EpisodeWorld, chosen: NDArray[np.float64]) -> Mapping[str, Any]:
+def _tell(world: EpisodeWorld, chosen: NDArray[np.float64], plan_xy: Sequence[Vec2]) -> Mapping[str, Any]:
     return {"at": round(world.time_s, 1), "ahead_m": float(chosen[29, 0])}
 
 
@@ -150,9 +151,16 @@ def test_a_policy_that_waits_for_less_or_creeps_is_not_hopeless() -> None:
     assert is_hopeless(_poses(np.arange(200) * 0.003), plan)
 
 
-def test_a_policy_six_metres_off_the_route_is_hopeless_at_once() -> None:
-    assert not is_hopeless(np.array(((3.0, 5.9, 0.0),)), _plan(policy_drives=True))
-    assert is_hopeless(np.array(((3.0, 6.1, 0.0),)), _plan(policy_drives=True))
+def test_a_policy_twenty_metres_off_the_route_is_hopeless_at_once() -> None:
+    assert not is_hopeless(np.array(((3.0, 19.9, 0.0),)), _plan(policy_drives=True))
+    assert is_hopeless(np.array(((3.0, 20.1, 0.0),)), _plan(policy_drives=True))
+
+
+def test_the_expert_drives_a_policys_robot_back_from_six_metres_off_the_route_until_it_is_within_one() -> None:
+    off_m = (0.0, 5.9, 6.1, 2.0, 1.1, 0.9, 5.9)
+    policys, experts = Rescue(_plan(policy_drives=True)), Rescue(_plan(policy_drives=False))
+    assert [policys.is_needed(SE2(3.0, y, 0.0)) for y in off_m] == [False, False, True, True, True, False, False]
+    assert not any(experts.is_needed(SE2(3.0, y, 0.0)) for y in off_m)
 
 
 # -- what is kept -----------------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from math import atan2, cos, hypot, pi, sin
 import numpy as np
 import pytest
 
-from edge.core.geometry import SE2
+from edge.core.geometry import SE2, wrap_angle
 from edge.state.reasoning_text import (
     AREAS,
     MOTIONS,
@@ -27,6 +27,7 @@ from edge.state.reasoning_text import (
     format_text,
     parse_text,
 )
+from sim_hil.benchmark.language.openings import Frame
 from sim_hil.crowd.people import RENDER_FIELDS
 from sim_hil.scene.scene import Scene
 from sim_hil.simulation.camera import CameraWorld
@@ -139,6 +140,36 @@ def test_the_plan_is_the_next_described_step_or_to_stop(kind: str) -> None:
 def test_a_goal_behind_the_robot_gives_turn_back() -> None:
     scenario = scenarios(CORRIDOR)[0]
     assert _tracer(scenario).trace(SE2(*scenario.task.start), *NOBODY, [(-1.0, 0.2)]).plan == Plan(TurnBack())
+
+
+@pytest.mark.slow
+def test_past_a_missed_opening_the_plan_is_to_turn_back_and_then_to_turn_to_the_other_side() -> None:
+    checked = 0
+    for scenario in all_scenarios():
+        tracer = _tracer(scenario)
+        for index, step in enumerate(scenario.route.steps):
+            if step.ordinal == 0 or step.side == "straight":
+                continue
+            frame, taken = Frame(step.ahead), step.counted[step.ordinal - 1]
+            x, y = frame.point(taken.high_m + 0.6, frame.across(step.at))
+            onward_rad = atan2(step.ahead[1], step.ahead[0])
+            progress = tracer.progress.at(SE2(x, y, 0.0))
+            if progress.step != index + 1 or progress.passed < step.ordinal:
+                continue  # a wall is there
+            onward = tracer.trace(SE2(x, y, onward_rad), *NOBODY, AHEAD).plan
+            back = tracer.trace(SE2(x, y, wrap_angle(onward_rad + pi)), *NOBODY, AHEAD).plan
+            assert onward == Plan(TurnBack())
+            assert back is not None and isinstance(back.action, Turn)
+            assert (back.action.side, back.action.area) == ("left" if step.side == "right" else "right", step.kind)
+            checked += 1
+    assert checked >= 3
+
+
+def test_stepping_back_from_a_person_is_not_turning_back() -> None:
+    scenario = scenarios(CORRIDOR)[0]
+    pose = SE2(5.0, -0.2, 0.0)
+    text = _tracer(scenario).trace(pose, _person(pose, 1.2, 0.0), np.zeros((1, 2)), AHEAD, 0.4)
+    assert _waits(text) and text.plan is not None and not isinstance(text.plan.action, TurnBack)
 
 
 def test_a_robot_that_stands_before_a_person_waits() -> None:

@@ -25,11 +25,13 @@ from tests.support.train.train_drives import WORDINGS, made_up_drive, progress_a
 from tools.train.config.sft import DrawConfig
 from tools.train.drives.trace_sentences import aspects_of_json
 from tools.train.samples.anchors import (
+    OFF_ROUTE_M,
     WAYPOINTS_START,
     Anchor,
     Drawn,
     Prompts,
     anchors_of,
+    believed_off_route,
     confused,
     draw,
     frames_at,
@@ -171,23 +173,48 @@ def test_wrong_progress_has_the_given_share_and_is_always_wrong(anchors: dict[in
     assert {each.wording for each in drawn} == set(WORDINGS)
 
 
-@pytest.mark.parametrize("action", [TurnBack(), Stop(3)])
-def test_off_the_route_the_missed_turn_counts_as_done_in_the_given_share(
-    action: TurnBack | Stop, anchors: dict[int, Anchor]
+@pytest.mark.parametrize(("action", "off_m"), [(TurnBack(), 0.0), (Stop(3), 2.5), (Stop(3), 2.0)])
+def test_off_the_route_the_prompt_has_the_progress_of_a_robot_that_does_not_know_it_in_the_given_share(
+    action: TurnBack | Stop, off_m: float, anchors: dict[int, Anchor]
 ) -> None:
-    config = DrawConfig(
-        before_min_s=1.0, before_max_s=1.0, before_late=0.0, before_wrong=0.0, before_ahead_off_route=0.4
-    )
-    anchor = dataclasses.replace(anchors[60], reasoning=dataclasses.replace(anchors[60].reasoning, plan=Plan(action)))
+    config = DrawConfig(before_min_s=1.0, before_max_s=1.0, before_late=0.0, before_wrong=0.0, before_unaware=0.4)
+    reasoning = dataclasses.replace(anchors[60].reasoning, plan=Plan(action))
+    anchor = dataclasses.replace(anchors[60], reasoning=reasoning, off_m=off_m)
     right, rng = anchor.before(1.0), np.random.default_rng(0)
+    assert right == Progress(1, 1, 1)
     drawn = [draw(anchor, config, rng).before for _ in range(1000)]
-    assert right is not None and set(drawn) <= {right, Progress(right.step + 1, right.steps, 0)}
-    share = np.mean([before != right for before in drawn])
-    assert share == (pytest.approx(0.4, abs=0.05) if isinstance(action, TurnBack) else 0)
+    turned, not_counted = Progress(2, 1, 0), Progress(1, 1, 0)
+    assert set(drawn) <= {right, turned, not_counted}
+    off = isinstance(action, TurnBack) or off_m > OFF_ROUTE_M
+    for believed in (turned, not_counted):
+        assert np.mean([before == believed for before in drawn]) == pytest.approx(0.2 if off else 0.0, abs=0.05)
+
+
+def test_in_a_wrong_opening_a_robot_may_have_counted_on() -> None:
+    assert Progress(2, 3, 1) in believed_off_route(Progress(1, 3, 0))
+    assert believed_off_route(Progress(4, 3, 0)) == []
+
+
+def test_in_a_policys_drive_the_prompt_has_the_progress_of_its_own_text_in_the_given_share(
+    anchors: dict[int, Anchor],
+) -> None:
+    own = Progress(2, 1, 0)
+    anchor = dataclasses.replace(anchors[60], believed=own)
+    config, rng = DrawConfig(before_wrong=0.0, before_own=0.7), np.random.default_rng(0)
+    assert np.mean([draw(anchor, config, rng).before == own for _ in range(1000)]) == pytest.approx(0.7, abs=0.05)
+
+
+def test_an_anchor_has_the_distance_to_the_route_and_the_policys_progress_of_its_trace() -> None:
+    drive, own = made_up_drive("a"), {"step": 2, "steps": 1, "passed": 0}
+    traces = tuple({**trace, "off_m": 0.1 * trace["k"], "believed": own} for trace in drive.traces)
+    found = anchors_of(dataclasses.replace(drive, about=dataclasses.replace(drive.about, traces=traces)))
+    assert [anchor.off_m for anchor in found] == pytest.approx([0.1 * anchor.k for anchor in found])
+    assert {anchor.believed for anchor in found} == {Progress(2, 1, 0)}
+    assert all(anchor.decides for anchor in found if anchor.off_m > OFF_ROUTE_M)
 
 
 def test_on_the_last_leg_no_turn_can_be_missed(anchors: dict[int, Anchor]) -> None:
-    config = DrawConfig(before_wrong=0.0, before_ahead_off_route=1.0)
+    config = DrawConfig(before_wrong=0.0, before_unaware=1.0)
     last = Progress(2, 1, 0)
     anchor = dataclasses.replace(
         anchors[60],
