@@ -29,7 +29,6 @@ from firmware_bridge.core.config import (
     BRIDGE_PRIORITY,
     OBSERVER_SUFFIX,
     OPERATOR_SUFFIX,
-    SERVICE_SOCKET,
     ConfigError,
     RobotConfig,
     load_robot_config,
@@ -67,11 +66,12 @@ EPILOG: Final = """examples:
   edge-bridge release --robot go2.toml   after a stop: send nothing to the robot, so that a person can use its remote
   edge-bridge status --robot go2.toml    what the running bridge is doing
 stop, arm, release and status look for a bridge at the installed service's socket (run them with sudo then, or as a
-member of tic-vla-operators) and at the robot file's, or at --socket only.
+member of tic-vla-operators) and at the robot file's, or at --socket only. With a robot file that cannot be used, stop
+looks at the usual places.
 exit codes: 0 ended by SIGINT or SIGTERM, robot stopped (stop, arm, release, status: done); 1 internal failure, robot
 stopped (stop: the robot has not reported that it stands still; use its remote); 2 bad arguments or robot file; 3
 refused: another bridge owns the socket (stop, arm, release, status: no bridge is running, or none that this user may
-reach; arm: no runner waits, or more than one bridge)"""
+reach; arm: no runner waits, or more than one bridge); 130 interrupted (stop, arm, release, status)"""
 
 
 class Bridge:
@@ -92,8 +92,7 @@ class Bridge:
         # Only a process that serves needs the protocol's library; a missing one is found before the bridge is ready.
         self._open_backend = backend_opener(config)
         self._robot: Backend = AbsentRobot("")
-        self._join_robot()
-        with contextlib.ExitStack() as opened:  # a socket that cannot be opened leaves none of the others behind
+        with contextlib.ExitStack() as opened:  # what cannot be opened leaves none of the others behind
             self._link = ClientLink(config.bridge.socket, group=groups.runner)
             opened.callback(self._link.close)
             operators = Path(f"{config.bridge.socket}{OPERATOR_SUFFIX}")
@@ -101,6 +100,8 @@ class Bridge:
             opened.callback(self._operators.close)
             observers = Path(f"{config.bridge.socket}{OBSERVER_SUFFIX}")
             self._observers = ClientLink(observers, places=_OBSERVERS, group=groups.runner)
+            opened.callback(self._observers.close)
+            self._join_robot()  # last: a second bridge must not disturb the robot's link
             opened.pop_all()
         self._estop_file = config.safety.estop_file
         latch = read_latch(latch_path)
@@ -136,11 +137,10 @@ class Bridge:
                 self._robot.write(StopMotion())
             raise
         finally:
-            self._link.close()
-            self._operators.close()
-            self._observers.close()
-            self._robot.close()
-            self._latch_file.close(_LOG_TIMEOUT_S)
+            with contextlib.ExitStack() as closing:  # each is closed, whatever another one raises; the robot first
+                closing.callback(self._latch_file.close, _LOG_TIMEOUT_S)
+                for part in (self._observers, self._operators, self._link, self._robot):
+                    closing.callback(part.close)
 
     def result(self) -> dict[str, object]:
         """The JSON result."""
@@ -339,29 +339,31 @@ def main(argv: list[str] | None = None) -> int:
         return 0
     args = parser.parse_args(argv)
     try:
-        if args.json not in (None, "-"):
+        if args.json not in (None, "-") and args.command != "stop":  # nothing may come before a stop
             check_output(Path(args.json))
     except OSError as error:
         _print(f"--json {args.json!r}: expected a file or -: {error.strerror or error}")
         return 2
     try:
-        config = load_robot_config(args.robot, socket=args.socket, domain=args.domain)
         if args.command == "serve":
+            config = load_robot_config(args.robot, socket=args.socket, domain=args.domain)
             if args.latch is not None:
                 check_latch_path(args.latch)
             latch = Path(f"{config.bridge.socket}.latch") if args.latch is None else args.latch
             code, result = 0, serve(config, latch, SocketGroups(args.runner_group, args.operator_group))
         else:
-            from firmware_bridge.operate import operate  # never part of the process that serves
+            from firmware_bridge.operate import operate, sockets_of  # never part of the process that serves
 
-            sockets = (config.bridge.socket,) if args.socket else (SERVICE_SOCKET, config.bridge.socket)
-            code, result = operate(args.command, *sockets)
+            code, result = operate(args.command, *sockets_of(args.command, args.robot, args.socket))
     except (SocketTakenError, ConfigError, LinkOpenError) as error:
         _print(error)
         return 3 if isinstance(error, SocketTakenError) else 2
     except ModuleNotFoundError as error:
         _print(f"{error.name} is missing: {INSTALL[config.protocol]}")
         return 2
+    except KeyboardInterrupt:  # of a process that serves it is a signal to leave
+        _print(f"{args.command} interrupted, perhaps after it was sent; see: edge-bridge status")
+        return 130
     text = json.dumps(result, indent=2) + "\n"
     try:
         if args.json == "-":

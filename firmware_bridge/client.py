@@ -35,10 +35,12 @@ class BridgeClient:
     `arm()`. Commands sent while arming satisfy the deadman but do not move the robot.
     """
 
-    def __init__(self, socket_path: Path | str) -> None:
-        """Connect and wait up to 1 s for the bridge's greeting. Raises BridgeUnavailable."""
+    def __init__(self, socket_path: Path | str, first: Message | None = None) -> None:
+        """Connect, send `first`, and wait up to 1 s for the bridge's greeting. Raises BridgeUnavailable."""
         self._status: BridgeStatus | None = None
         self._socket = connect(Path(socket_path))
+        if first is not None:
+            self._send(first)
         poller = select.poll()
         poller.register(self._socket, select.POLLIN)
         status = None

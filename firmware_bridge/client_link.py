@@ -213,12 +213,16 @@ class ClientLink:
             fresh.close()  # without a greeting: its BridgeClient reports another client
 
     def _datagrams(self, client: socket.socket) -> Iterator[bytes]:
+        was_reset = False
         for _ in range(_MAX_DATAGRAMS_A_STEP):
             try:
                 data = client.recv(MAX_DATAGRAM_BYTES + 1)  # a longer datagram fails the length check
             except BlockingIOError:
                 return
-            except OSError:
+            except OSError as error:
+                if isinstance(error, ConnectionResetError) and not was_reset:
+                    was_reset = True  # it left with unread statuses; what it had sent before is still to be read
+                    continue
                 data = b""
             if not data:
                 self._drop(client)

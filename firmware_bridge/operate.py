@@ -16,8 +16,15 @@ from pathlib import Path
 from typing import Final
 
 from firmware_bridge.client import BridgeClient, BridgeUnavailable
-from firmware_bridge.core.config import OPERATOR_SUFFIX
-from firmware_bridge.core.link import BridgeStatus
+from firmware_bridge.core.config import (
+    OPERATOR_SUFFIX,
+    ROBOT_FILE_SOCKET,
+    SERVICE_SOCKET,
+    ConfigError,
+    load_robot_config,
+    runtime_dir,
+)
+from firmware_bridge.core.link import BridgeStatus, Stop
 from firmware_bridge.system.terminal import one_line
 
 CONFIRM_S: Final = 1.0
@@ -44,6 +51,21 @@ def _write(text: str) -> None:
     """Write one line of `edge-bridge` to stderr."""
     sys.stderr.write(f"edge-bridge: {text}\n")
     sys.stderr.flush()
+
+
+def sockets_of(command: str, robot: str, socket: Path | None, say: Say = _write) -> tuple[Path, ...]:
+    """Return the sockets at which `command` looks for a bridge: `socket` alone, or the service's and the robot file's.
+
+    Raises ConfigError for a robot file that cannot be used; a stop is sent to the usual places then.
+    """
+    try:
+        own = load_robot_config(robot, socket=socket).bridge.socket
+    except ConfigError as error:
+        if command != "stop":
+            raise
+        say(one_line(error))
+        own = socket or runtime_dir() / ROBOT_FILE_SOCKET
+    return (own,) if socket else (SERVICE_SOCKET, own)
 
 
 def operate(command: str, *sockets: Path, say: Say = _write) -> tuple[int, dict[str, object]]:
@@ -115,7 +137,8 @@ def _operate(command: str, say: Say, socket: Path) -> Answer:
     deadline_ns = time.monotonic_ns() + round(CONFIRM_S * 1e9)
     while True:
         try:
-            client = BridgeClient(f"{socket}{OPERATOR_SUFFIX}")
+            # A bridge that does not run now reads the stop as soon as it runs again.
+            client = BridgeClient(f"{socket}{OPERATOR_SUFFIX}", first=Stop() if command == "stop" else None)
             try:
                 return _stop(client, say) if command == "stop" else _ask(command, client)
             finally:

@@ -22,15 +22,13 @@ from edge.core.cli import (
     messages,
 )
 from edge.run.stop_phrase import is_stop_phrase
-from firmware_bridge.core.config import OPERATOR_SUFFIX, SERVICE_SOCKET, runtime_dir
+from firmware_bridge.core.config import OPERATOR_SUFFIX, ROBOT_FILE_SOCKET, SERVICE_SOCKET, runtime_dir
 from firmware_bridge.system.terminal import CommandParser
 
 ANSWER_S = 2.0
 STOP_ANSWER_S = 3.0  # the runner waits up to 2 s for the robot to stand still
 STOP: Final = "stop"
 """Text that the runner receives for every stop phrase."""
-ROBOT_FILE_SOCKET: Final = "bridge.sock"
-"""File name of the bridge's socket in the shipped robot files."""
 
 EXAMPLES = """examples:
   edge-run --artifacts out/nano --robot go2.toml --instructions say.sock --instruction "go down the corridor"

@@ -6,6 +6,7 @@ Interfaces: "serial" (a serial line or a pty), "socketcan" (a real bus), "virtua
 
 from __future__ import annotations
 
+import termios
 from collections import deque
 from dataclasses import dataclass
 from typing import Final
@@ -60,7 +61,7 @@ def open_bus(address: BusAddress) -> can.BusABC:
 
             return LoopbackMulticastBus(address.channel)
         bus = can.Bus(channel=address.channel, interface=address.interface)
-    except (can.CanError, OSError, ValueError, ImportError) as error:  # pyserial's SerialException is an OSError
+    except (can.CanError, OSError, ValueError, ImportError, termios.error) as error:  # SerialException is an OSError
         raise BusError(f"CAN bus {address}: cannot be opened: {error}") from error
     if address.interface == "socketcan":
         bus.socket.setblocking(False)  # type: ignore[attr-defined]  # a full send buffer must not wait
@@ -93,7 +94,8 @@ class FrameBus:
         frames = []
         try:
             for _ in range(most):
-                message = self._bus.recv(0.0)
+                # `recv` measures its waiting with the wall clock: one that is set back would make it wait.
+                message, _ = self._bus._recv_internal(0.0)
                 if message is None:
                     break
                 frame = as_frame(message)

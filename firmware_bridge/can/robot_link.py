@@ -25,6 +25,8 @@ _FAILING_NS: Final = 1_000_000_000
 _REOPEN_NS: Final = 500_000_000
 _STOPS_IGNORED: Final = 20
 """Requests to stop, every 100 ms, after which a base that still moves gets its own emergency stop."""
+_OBEYED_NS: Final = 1_000_000_000
+"""Time without a request to stop after which the base has obeyed the earlier ones."""
 _MOST_SPEED: Final = 1e3  # far above every limit: keeps a value that is no number off the bus
 
 
@@ -43,7 +45,7 @@ class RobotLink:
         self._reader = BaseReader(self._can, self._database, self._now_ns, accepted)
         self._sender = FrameSender(self._database)
         self._bus: FrameBus | None = self._opened()
-        self._reopen_ns = self._refused_ns = 0
+        self._reopen_ns = self._refused_ns = self._stop_ns = 0
         self._failing = self._failed = self._line_errors = self._stops = 0
         self._health = self._reader.health.state
         self._mode = 0 if self._can.mode is None else self._can.mode.disarm
@@ -111,7 +113,8 @@ class RobotLink:
 
     def _stop(self) -> None:
         """Disarm the base, or command zero where it has no modes; at last use its own emergency stop."""
-        self._stops += 1
+        obeyed = self._now_ns - self._stop_ns > _OBEYED_NS
+        self._stops, self._stop_ns = 1 if obeyed else self._stops + 1, self._now_ns
         if self._can.mode is None:
             self._drive(0.0, 0.0)
         else:

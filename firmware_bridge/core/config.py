@@ -35,6 +35,7 @@ __all__ = [
     "BRIDGE_PRIORITY",
     "OBSERVER_SUFFIX",
     "OPERATOR_SUFFIX",
+    "ROBOT_FILE_SOCKET",
     "SERVICE_SOCKET",
     "BridgeConfig",
     "CameraConfig",
@@ -79,6 +80,8 @@ FASTEST: Final[dict[str, dict[str, tuple[float, float]]]] = {
     "ros2": {**_FORWARD, "vy_max_mps": (0.5, 1.0)},
 }
 SERVICE_SOCKET: Final = Path("/run/tic-vla-edge/bridge.sock")  # where `edge-install units` lets the service listen
+ROBOT_FILE_SOCKET: Final = "bridge.sock"
+"""File name of the bridge's socket in the shipped robot files, in `runtime_dir`."""
 BRIDGE_PRIORITY: Final = 60  # real-time priority of that service; no thread of the runner may reach it
 
 

@@ -45,6 +45,10 @@ class ModeWatch:
         """Note that the bridge requests a mode of this kind."""
         self._asked[kind] = now_ns
 
+    def has_asked(self, kind: str, now_ns: int) -> bool:
+        """Return whether a requested mode of this kind may still come."""
+        return now_ns - self._asked.get(kind, -_ASKED_NS) < _ASKED_NS
+
     def begin_arming(self) -> None:
         """Note that the bridge arms: from now on it may request modes again."""
         self.yielded = False

@@ -94,7 +94,7 @@ class Session:
         self._now_ns = 0
         self._foreign: str | None = None
         self._clash_ns = -_CLASH_NS
-        self._identifying = False
+        self._identifying = self._stopped = False
         self._heartbeat_ns = 0
         self._intervals: list[int] = []
         self._intervals_ns = 0
@@ -142,6 +142,8 @@ class Session:
             self._request_intervals()
         if self.watch.yielded:
             self.commands.cancel(SET_MODE, ARM_DISARM)
+        elif self._stopped and self.watch.kind == modes.DRIVE:
+            self._hold()  # a drive mode requested before the stop came after it
 
     def _give_way(self) -> None:
         """Request no mode until the next arming: another station has commanded the rover."""
@@ -305,6 +307,7 @@ class Session:
             self._stop(now_ns)
 
     def _stand(self, step: int, now_ns: int) -> None:
+        self._stopped = False
         if not self.watch.in_use():
             self.watch.begin_arming()
         if not self.watch.may_command():
@@ -320,14 +323,19 @@ class Session:
             self._hold()
 
     def _stop(self, now_ns: int) -> None:
-        """Zero velocity and hold mode, unless somebody else has changed the mode."""
+        """Zero velocity and hold mode, unless somebody else has changed the mode.
+
+        A requested drive mode that has not come yet is given up, or undone by hold.
+        """
         self._setpoint(0.0, 0.0, 0.0)
+        self._stopped = True
         self._stream_until_ns = now_ns  # from here on, only the rules' own zeros
         self.commands.cancel(ARM_DISARM)
-        if self.watch.may_command() and self.watch.kind != modes.HOLD:
-            self._hold()
-        elif not self.watch.may_command():
+        requested = self.commands.waits(SET_MODE) or self.watch.has_asked(modes.DRIVE, now_ns)
+        if not self.watch.may_command():
             self.commands.cancel(SET_MODE)
+        elif requested or self.watch.kind != modes.HOLD:
+            self._hold()
 
     def _hold(self) -> None:
         self.commands.request(SET_MODE, _CUSTOM_MODE, *map(float, self._autopilot.hold))

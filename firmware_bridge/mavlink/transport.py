@@ -7,6 +7,7 @@ import errno
 import fcntl
 import os
 import socket
+import sys
 import termios
 import tty
 from typing import Final, Protocol
@@ -17,6 +18,7 @@ from firmware_bridge.core.robot_state import LinkOpenError
 _MAX_DATAGRAM_BYTES: Final = 2048
 _MAX_DATAGRAMS: Final = 64  # a step: 3200 a second at 50 Hz
 _MAX_SERIAL_BYTES: Final = 4096  # a step: 2 Mbaud at 50 Hz
+_MOST_WAITING: Final = 512  # bytes that a serial line has not taken yet: 90 ms at 57600 baud
 _REOPEN_NS: Final = 1_000_000_000
 
 
@@ -112,10 +114,19 @@ class SerialTransport:
         return [data] if data else []
 
     def send(self, data: bytes) -> bool:
-        """Send one packet, or nothing of it while the line still owes the rest of an earlier one."""
-        if not self._write(self._rest) or self._rest:
+        """Send one packet, or nothing of it while the line owes earlier ones: a late command is worse than none."""
+        if not self._write(self._rest) or self._rest or self._waiting_bytes() > _MOST_WAITING:
             return False
         return self._write(data)
+
+    def _waiting_bytes(self) -> int:
+        """Return the number of bytes that the system has taken and the line has not."""
+        if self._file is None:
+            return 0
+        try:
+            return int.from_bytes(fcntl.ioctl(self._file, termios.TIOCOUTQ, bytes(4)), sys.byteorder)
+        except OSError:
+            return 0  # not every line tells
 
     def _write(self, data: bytes) -> bool:
         """Write; what does not fit is kept in `_rest`, because half a packet destroys the next one."""

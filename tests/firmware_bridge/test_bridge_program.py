@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 import tokenize
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,8 +19,11 @@ import pytest
 from firmware_bridge.bridge import Bridge, is_pressed, take_priority
 from firmware_bridge.bridge import main as bridge_main
 from firmware_bridge.client import BridgeClient, BridgeUnavailable
-from firmware_bridge.core.config import BRIDGE_PRIORITY
+from firmware_bridge.client_link import ClientLink, SocketTakenError
+from firmware_bridge.core.config import BRIDGE_PRIORITY, SERVICE_SOCKET, load_robot_config, runtime_dir
 from firmware_bridge.core.link import BridgeStatus
+from firmware_bridge.system.line_log import LineLog
+from firmware_bridge.system.notify import Notifier
 from tests.support.processes import GO2_SIM, REPOSITORY
 
 
@@ -170,6 +174,66 @@ def lines_of_code(source: str) -> int:
 def test_without_a_bridge_the_client_advises_the_user(tmp_path: Path) -> None:
     with pytest.raises(BridgeUnavailable, match="start `edge-bridge"):
         BridgeClient(tmp_path / "bridge.sock")
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
+    """What would have been sent, and to which sockets."""
+    found: list[tuple[str, ...]] = []
+
+    def operate(command: str, *sockets: Path) -> tuple[int, dict[str, object]]:
+        found.append((command, *map(str, sockets)))
+        return 0, {}
+
+    monkeypatch.setattr("firmware_bridge.operate.operate", operate)
+    return found
+
+
+@pytest.mark.parametrize("broken", ["", "[bridge]\nsocket = 5\n", "\x00", None])
+def test_a_stop_needs_no_usable_robot_file(
+    tmp_path: Path, broken: str | None, asked: list[tuple[str, ...]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot = tmp_path / "robot.toml"
+    if broken is not None:
+        robot.write_text(broken)
+    usual = (str(SERVICE_SOCKET), str(runtime_dir() / "bridge.sock"))
+    assert bridge_main(["stop", "--robot", str(robot)]) == 0
+    assert asked == [("stop", *usual)]
+    assert "robot.toml" in capsys.readouterr().err
+    assert bridge_main(["stop", "--robot", str(robot), "--socket", "/own.sock"]) == 0
+    assert asked[1:] == [("stop", "/own.sock")]
+    assert bridge_main(["arm", "--robot", str(robot)]) == 2 and len(asked) == 2
+
+
+def test_a_stop_is_sent_although_its_result_cannot_be_written(
+    tmp_path: Path, asked: list[tuple[str, ...]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    nowhere = str(tmp_path)  # a folder
+    assert bridge_main(["stop", "--robot", str(GO2_SIM), "--json", nowhere]) == 1
+    assert [command for command, *_ in asked] == ["stop"]
+    assert "the result could not be written" in capsys.readouterr().err
+    assert bridge_main(["arm", "--robot", str(GO2_SIM), "--json", nowhere]) == 2 and len(asked) == 1
+
+
+def test_an_interrupted_operators_command_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: object) -> tuple[int, dict[str, object]]:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("firmware_bridge.operate.operate", interrupted)
+    assert bridge_main(["stop", "--robot", str(GO2_SIM)]) == 130
+    error = capsys.readouterr().err
+    assert "interrupted" in error and error.count("\n") == 1
+
+
+def test_a_second_bridge_does_not_touch_the_robots_link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Bridge, "_join_robot", lambda _: pytest.fail("the link was opened"))
+    path = tmp_path / "bridge.sock"
+    config, log = load_robot_config(GO2_SIM, socket=path), LineLog(io.StringIO(), "edge-bridge")
+    with closing(ClientLink(path)), pytest.raises(SocketTakenError):
+        Bridge(config, log, Notifier({}), tmp_path / "latch")
+    log.close(1.0)
 
 
 @pytest.mark.parametrize("command", ["stop", "arm", "status"])

@@ -122,6 +122,22 @@ class TestDatagrams:
                 client.send(STOP)
             assert [len(link.receive()) for _ in range(3)] == [64, 36, 0]
 
+    def test_what_a_client_sent_before_it_left_is_read_although_it_left_statuses_unread(self, path: Path) -> None:
+        with closing(ClientLink(path)) as link:
+            client = connected_to(path)
+            link.receive()
+            link.send_status(STATUS)
+            client.send(STOP)
+            client.close()
+            assert link.receive() == [Stop()]
+            assert not link.connected
+
+    def test_a_stop_that_is_sent_while_the_bridge_hangs_is_read_when_it_runs_again(self, path: Path) -> None:
+        with closing(ClientLink(path)) as link:
+            with pytest.raises(BridgeUnavailable, match="does not answer"):
+                BridgeClient(path, first=Stop())
+            assert link.receive() + link.receive() == [Stop()]
+
     def test_a_connection_that_breaks_counts_as_gone(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         def broken(*_: object) -> bytes:
             raise OSError(errno.ECONNRESET, os.strerror(errno.ECONNRESET))

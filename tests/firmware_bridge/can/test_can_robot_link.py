@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import termios
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -11,7 +12,7 @@ from pathlib import Path
 import can
 import pytest
 
-from firmware_bridge.can.buses import BusError, FrameBus
+from firmware_bridge.can.buses import BusAddress, BusError, FrameBus, open_bus
 from firmware_bridge.can.frame import Frame
 from firmware_bridge.can.robot_link import RobotLink
 from firmware_bridge.can.serial_line import SerialLine
@@ -135,8 +136,8 @@ class Echoing:
     def send(self, message: can.Message, timeout: float | None = None) -> None:
         self.waiting.append(message)
 
-    def recv(self, timeout: float) -> can.Message | None:
-        return self.waiting.pop(0) if self.waiting else None
+    def _recv_internal(self, timeout: float) -> tuple[can.Message | None, bool]:
+        return (self.waiting.pop(0) if self.waiting else None), False
 
 
 def test_a_frame_that_comes_back_from_our_own_bus_is_not_another_controllers() -> None:
@@ -147,6 +148,25 @@ def test_a_frame_that_comes_back_from_our_own_bus_is_not_another_controllers() -
     assert bus.receive(10) == []
     echo.waiting.append(link_frame)  # the same bytes once more: somebody else sent them
     assert bus.receive(10) == [Frame(272, b"abcdef")]
+
+
+def test_reading_the_bus_does_not_depend_on_the_wall_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    bus = FrameBus(can.Bus(interface="virtual", channel="wall-clock"), echoes=False)
+    sender = can.Bus(interface="virtual", channel="wall-clock")
+    sender.send(can.Message(arbitration_id=272, data=b"abc", is_extended_id=False))
+    monkeypatch.setattr("can.bus.time", lambda: pytest.fail("the wall clock was read"))
+    assert bus.receive(10) == [Frame(272, b"abc")]
+    bus.close()
+    sender.shutdown()
+
+
+def test_a_line_that_vanishes_while_it_is_opened_is_a_bus_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    def vanish(channel: str) -> can.BusABC:
+        raise termios.error(5, "Input/output error")
+
+    monkeypatch.setattr("firmware_bridge.can.serial_line.SerialLine", vanish)
+    with pytest.raises(BusError, match="Input/output error"):
+        open_bus(BusAddress("serial", "/dev/ttyACM0"))
 
 
 @pytest.mark.parametrize("waiting", [300, 1000])

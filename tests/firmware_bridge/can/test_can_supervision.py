@@ -327,3 +327,16 @@ def test_frames_refused_long_ago_do_not_forbid_arming(opened: Opener) -> None:
     bench.until(lambda status: status.cause == "link_down", 3.0, "a refused arming")
     rig.link._bus._bus.send = send  # type: ignore[method-assign]
     bench.until(lambda status: status.state == "armed", 5.0, "armed")
+
+
+@pytest.mark.parametrize(("pauses_ms", "expected"), [([100] * 19, 1), ([100] * 9 + [1100] + [100] * 9, 0)])
+def test_only_a_base_that_disobeys_one_stop_after_the_other_gets_its_own_emergency_stop(
+    opened: Opener, monkeypatch: pytest.MonkeyPatch, pauses_ms: list[int], expected: int
+) -> None:
+    rig, _ = opened()
+    requested: list[float] = []
+    monkeypatch.setattr(rig.link, "_request_estop", requested.append)
+    for pause_ms in (0, *pauses_ms):
+        rig.link._now_ns += pause_ms * MS
+        rig.link._stop()
+    assert len(requested) == expected

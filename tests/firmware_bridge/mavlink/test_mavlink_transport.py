@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import socket
+import sys
 import tty
 from collections.abc import Iterator
 from dataclasses import replace
@@ -59,6 +60,17 @@ class TestSerial:
                 break
             line.send(b"")
         assert received == b"".join(sent)[: len(received)] and len(received) >= 50 * (len(sent) - 1)
+        line.close()
+
+    @pytest.mark.parametrize(("waiting", "taken"), [(512, True), (513, False)])
+    def test_a_line_that_is_too_slow_refuses_packets_so_that_none_comes_late(
+        self, pty_pair: tuple[int, Path], monkeypatch: pytest.MonkeyPatch, waiting: int, taken: bool
+    ) -> None:
+        ours, path = pty_pair
+        line = SerialTransport(str(path), BAUD)
+        monkeypatch.setattr("fcntl.ioctl", lambda *_: waiting.to_bytes(4, sys.byteorder))
+        assert line.send(b"packet") == taken
+        assert (os.read(ours, 100) if taken else b"packet") == b"packet"
         line.close()
 
     def test_a_line_that_vanishes_is_opened_again_after_a_second(
