@@ -63,7 +63,7 @@ EPILOG: Final = """examples:
   edge-bridge arm --robot go2.toml       permit the runner that waits now to arm once, within 10 s: after an emergency
                                          stop (operator, remote, GPIO file), and before every arming where the robot
                                          file says operator_arm
-  edge-bridge release --robot go2.toml   after a stop: send nothing to the robot, so that a person can use its remote
+  edge-bridge release --robot go2.toml   after a stop: send no command, so that a person can use the remote
   edge-bridge status --robot go2.toml    what the running bridge is doing
 stop, arm, release and status look for a bridge at the installed service's socket (run them with sudo then, or as a
 member of tic-vla-operators) and at the robot file's, or at --socket only. With a robot file that cannot be used, stop

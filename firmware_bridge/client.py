@@ -68,7 +68,7 @@ class BridgeClient:
         return self._send(Stop())
 
     def release(self) -> bool:
-        """Operator's socket only: let the bridge send nothing until the next arming. False when it was not sent."""
+        """Operator's socket only: let the bridge send no command until the next arming. False when it was not sent."""
         return self._send(Release())
 
     def poll(self) -> BridgeStatus | None:

@@ -73,7 +73,7 @@ class Stop:
 
 @dataclass(frozen=True)
 class Release:
-    """Operator's request that the bridge sends nothing, so that a person can use the robot's remote."""
+    """Operator's request that the bridge sends no command, so that a person can use the robot's remote."""
 
 
 @dataclass(frozen=True)

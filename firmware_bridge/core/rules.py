@@ -186,7 +186,7 @@ class BridgeCore:
         if self._state in ("stopped", "disarmed"):
             self._released = True
             self._permit.void()
-            self._reason = "released by an operator: the bridge sends nothing until the next arming"
+            self._reason = "released by an operator: the bridge sends no command until the next arming"
 
     def _danger(self, now_ns: int) -> Reason | None:
         """Return what forbids motion now, in every state."""

@@ -55,7 +55,7 @@ class TestRelease:
         before = len(bench.written)
         bench.wait(1000)
         assert len(bench.written) == before
-        assert bench.status.reason == "released by an operator: the bridge sends nothing until the next arming"
+        assert bench.status.reason == "released by an operator: the bridge sends no command until the next arming"
 
     def test_a_robot_that_was_never_armed_is_released_too(self) -> None:
         bench = Bench()
