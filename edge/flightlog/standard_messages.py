@@ -2,7 +2,7 @@
 
 | record | messages |
 |---|---|
-| `/camera` (itself a CompressedImage) | `/camera/calibration` with the first picture of every size |
+| `/camera` (itself a CompressedImage) | `/camera/calibration` once a file or view, with its first picture |
 | `/tick` | `/tf` odom → base → camera, `/plan`, `/velocity`; driven path and odometry's uncertainty in `/scene` |
 | `/semantic` | anchor and waypoints in `/scene`, the reasoning text in `/log` |
 | `/fault`, `/run`, `/result` | `/log` |

@@ -1,10 +1,12 @@
-"""Metrics of a run in the OpenMetrics text format; docs/robot.md has the table of names.
+"""Metrics of a run in the OpenMetrics text format; docs/watch.md has the table of names.
 
-Histograms count the records that reached the view: a tick that was replaced by a newer one is not in them.
+Histograms count the records that reached the view: a tick that was replaced by a newer one is not in them. A gauge is
+NaN where the newest record has no value: its last value would look measured.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -62,6 +64,7 @@ class Metrics:
             elif topic == "/fault" and record["change"] == "raised":
                 self._faults.labels(record["name"], record["action"]).inc()
             elif topic == "/power":
+                self._power.clear()  # without a meter the tag is another: the earlier tag's power is not now's
                 _set(self._power.labels(str(record["tagged"])), record["total_w"])
                 _set(self._budget, record["budget_w"])
                 _set(self._temperature, record["temperature_c"])
@@ -82,9 +85,9 @@ class Metrics:
         age_ms = record["frame_age_ms"]
         _set(self._frame_age, None if age_ms is None else age_ms / 1e3)
         for kind, values in (("commanded", record["command"]), ("measured", record["state"])):
-            if values is not None:
-                self._speed.labels(kind).set(values[0])
-                self._yaw.labels(kind).set(values[2])
+            vx_mps, _, wz_radps = (None, None, None) if values is None else values
+            _set(self._speed.labels(kind), vx_mps)
+            _set(self._yaw.labels(kind), wz_radps)
 
     def text(self, dropped: int) -> bytes:
         """Return the metrics as text; `dropped`: records that the view did not receive or could not read."""
@@ -93,5 +96,4 @@ class Metrics:
 
 
 def _set(gauge: Gauge, value: float | None) -> None:
-    if value is not None:
-        gauge.set(value)
+    gauge.set(math.nan if value is None else value)

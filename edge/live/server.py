@@ -111,6 +111,8 @@ class LiveServer:
         self._pages: set[Client] = set()
         self._viewers: set[Client] = set()
         self._session = secrets.token_hex(4)
+        self._run_ns: int | None = None
+        """Stamp of the `/run` record: the page finds in it which run an answer to STOP belongs to."""
         self._malformed = 0
         self._dropped = 0  # by the runner
 
@@ -143,6 +145,7 @@ class LiveServer:
                     self._offer(topic, stamp_ns, encode(datagram.payload, stamp_ns), COMPRESSED_IMAGE)
             elif datagram.kind == wire.RECORD:
                 record = json.loads(datagram.payload)
+                self._run_ns = stamp_ns if topic == "/run" else self._run_ns
                 self._metrics.take(topic, record)
                 self._show(self._state.record(topic, stamp_ns, record))
                 self._offer(topic, stamp_ns, datagram.payload, _SCHEMA_OF.get(topic, ANY_OBJECT))
@@ -287,7 +290,7 @@ class LiveServer:
             raise web.HTTPForbidden(text="a stop needs the token in the header Authorization\n")
         if self._stop is None:
             raise web.HTTPConflict(text="this view stops nothing: use the runner's view, or edge-bridge stop\n")
-        return web.json_response(await self._stop.stop())
+        return web.json_response({**await self._stop.stop(), "run": self._run_ns})
 
 
 def _page_data(message: Message) -> str | bytes:

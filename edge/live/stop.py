@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import enum
 import functools
 import socket
 from pathlib import Path
 from typing import Any, Final
 
+from edge.core.cli import EXIT_DONE, EXIT_REFUSED
 from edge.live import wire
 from firmware_bridge.operate import operate
 
@@ -17,6 +19,16 @@ ANSWER_S: Final = 3.0
 """Time for either of them to confirm the stop after that, s: the robot comes to rest within 2 s."""
 LAST_S: Final = 4.0
 """Time for the stops under way when the runner has ended, s."""
+
+
+class OperatorStop(enum.Enum):
+    """Outcome of an operator's stop; the value tells the user what it means for the next arming."""
+
+    STANDS = "Before it moves again: edge-bridge arm"
+    IN_EFFECT = "The operator's stop is in effect. Before it moves again: edge-bridge arm"
+    """The bridge refuses to arm because of it, and the robot did not report standstill in time."""
+    UNKNOWN = "It is unknown whether the operator's stop is in effect: a new run may arm"
+    IMPOSSIBLE = "No operator's stop was possible: a new run can arm"
 
 
 class RobotStop:
@@ -48,17 +60,20 @@ class RobotStop:
     async def _stop(self) -> dict[str, Any]:
         operator = asyncio.create_task(_stop_as_operator(self._bridge))
         await asyncio.wait({operator}, timeout=OPERATOR_FIRST_S)
-        if not _confirms(operator):
+        by_runner = False
+        if _outcome(operator) is not OperatorStop.STANDS:
             runner = asyncio.create_task(self._stop_by_runner())
             await asyncio.wait({operator}, timeout=ANSWER_S)
-            if not _confirms(operator) and await runner:
-                text = "stopped by the runner, whose bridge confirms it. No operator's stop was possible: "
-                return {"stopped": True, "latched": False, "text": f"{text}a new run can arm"}
-        if _confirms(operator):
-            text = "stopped: the robot reports that it stands. Before it moves again: edge-bridge arm"
-            return {"stopped": True, "latched": True, "text": text}
-        text = "NOT CONFIRMED: use the robot's remote, or switch the robot off"
-        return {"stopped": False, "latched": False, "text": text}
+            by_runner = _outcome(operator) is not OperatorStop.STANDS and await runner
+        found = _outcome(operator)
+        if found is OperatorStop.STANDS:
+            text = f"stopped: the robot reports that it stands. {found.value}"
+        elif by_runner:
+            text = f"stopped by the runner, whose bridge confirms it. {found.value}"
+        else:
+            text = "NOT CONFIRMED: use the robot's remote, or switch the robot off"
+        latched = found in (OperatorStop.STANDS, OperatorStop.IN_EFFECT)
+        return {"stopped": found is OperatorStop.STANDS or by_runner, "latched": latched, "text": text}
 
     async def _stop_by_runner(self) -> bool:
         """Request a stop of the runner; return whether its bridge has confirmed it."""
@@ -72,15 +87,20 @@ class RobotStop:
             return False
 
 
-async def _stop_as_operator(bridge: Path) -> bool:
-    """Stop the robot by the operator's socket of its bridge; return whether the bridge reports standstill."""
+async def _stop_as_operator(bridge: Path) -> OperatorStop:
+    """Stop the robot by the operator's socket of its bridge; return the outcome."""
     quiet = functools.partial(operate, "stop", bridge, say=lambda line: None)  # a terminal may block or be gone
     try:
-        code, _ = await asyncio.get_running_loop().run_in_executor(None, quiet)
+        code, status = await asyncio.get_running_loop().run_in_executor(None, quiet)
     except Exception:  # noqa: BLE001 - whatever it is, the runner still stops the robot
-        return False
-    return code == 0
+        return OperatorStop.UNKNOWN
+    if code == EXIT_DONE:
+        return OperatorStop.STANDS
+    if status.get("blocked_by") == "estop":
+        return OperatorStop.IN_EFFECT
+    return OperatorStop.IMPOSSIBLE if code == EXIT_REFUSED else OperatorStop.UNKNOWN
 
 
-def _confirms(stop: asyncio.Task[bool]) -> bool:
-    return stop.done() and stop.result()
+def _outcome(stop: asyncio.Task[OperatorStop]) -> OperatorStop:
+    """Return the outcome of an operator's stop so far."""
+    return stop.result() if stop.done() else OperatorStop.UNKNOWN

@@ -140,7 +140,7 @@ def _output_directory(out: Path | None) -> Iterator[Path]:
 
 @contextmanager
 def _live_view(args: argparse.Namespace, clock: str) -> Iterator[LiveOptions | None]:
-    """Print the one address of all episodes' live views; their runners share its port and token.
+    """Print the address of all episodes' live views, and that for other computers; their runners share port and token.
 
     Raises ConfigError or LiveError.
     """
@@ -157,7 +157,10 @@ def _live_view(args: argparse.Namespace, clock: str) -> Iterator[LiveOptions | N
     with tempfile.TemporaryDirectory(prefix="edge-bench-live-") as folder:
         if live.token_file is None:
             live = replace(live, token_file=Path(folder) / "token")
-        _report_problem(f"live view, while an episode drives: {live.url(live.port, live.token())}", EXIT_DONE)
+        token = live.token()
+        _report_problem(f"live view, while an episode drives: {live.url(live.port, token)}", EXIT_DONE)
+        if (elsewhere := live.url_elsewhere(live.port, token)) is not None:
+            _report_problem(f"live view for other computers: {elsewhere}", EXIT_DONE)
         yield live
 
 

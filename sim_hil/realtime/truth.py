@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from firmware_bridge.system.input_file import parse_json
 
 
 @dataclass(frozen=True)
@@ -58,12 +59,14 @@ class TruthTail(LineTail):
 
 
 def parsed(text: bytes) -> Iterator[dict[str, Any]]:
-    """Yield the objects of a JSON-lines text; an incomplete line (only the last can be) is left out."""
+    """Yield the objects of a JSON-lines text; lines that are incomplete or no object are left out."""
     for line in text.splitlines():
         try:
-            yield json.loads(line)
+            content = parse_json(line)
         except ValueError:
             continue
+        if isinstance(content, dict):
+            yield content
 
 
 def read_lines(path: Path) -> Iterator[dict[str, Any]]:

@@ -36,12 +36,14 @@ def cards(path: Path, flight: Flight, found: Sequence[Explanation]) -> list[dict
 def explained_run(data: RunData) -> tuple[list[dict[str, Any]], int] | None:
     """Return the cards of a simulated run's events and their number; None for a log that cannot be explained.
 
-    The simulator's trace is the truth; it has no times of contacts and no path to the goal.
+    The simulator's trace is the truth; it has no times of contacts and no path to the goal. The last event is always
+    shown: it is the one that ended the run, if any did.
     """
     try:
-        flight = replace(read_flight(data.log.path), truths=truths(data.trace), result={})
+        flight = replace(read_flight(data.log.path), truths=truths(data.trace))
         found = explain(flight)
-        return cards(data.log.path, flight, found)[:SHOWN_EVENTS], len(found)
+        shown = found if len(found) <= SHOWN_EVENTS else [*found[: SHOWN_EVENTS - 1], found[-1]]
+        return cards(data.log.path, flight, shown), len(found)
     except (RecordingError, OSError):
         return None
 

@@ -1,4 +1,4 @@
-"""Parts of the chain from picture to motion at one tick: generation in force, people in view, waypoints, drift."""
+"""Parts of the chain from picture to motion at one tick: generation in force, people ahead, waypoints, drift."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from edge.flightlog.replay.records import RecordedGeneration, RecordedTick
 from edge.state.reasoning_text import parse_waypoints
 
 NEAR_M: Final = 3.0
-"""A person this near and within the picture must be in the text, m."""
+"""A person this near and ahead must be in the text, m, unless something hides the person."""
 VIEW_RAD: Final = math.radians(45)
 """Half of the picture's width, less a margin, rad (field of view 100°)."""
 
@@ -21,8 +21,11 @@ def generation_of(flight: Flight, tick: RecordedTick) -> RecordedGeneration | No
     return None if tick.generation is None else flight.generations.get(tick.generation)
 
 
-def people_in_view(truth: Truth, within_m: float) -> list[tuple[float, float]]:
-    """Return distance, m, and direction, rad, of the people in the picture's field of view, the nearest first."""
+def people_ahead(truth: Truth, within_m: float) -> list[tuple[float, float]]:
+    """Return distance, m, and direction, rad, of the people in the camera's field of view, the nearest first.
+
+    The truth has no walls, so a wall or another person may hide each of them from the camera.
+    """
     seen = []
     for x_m, y_m in truth.people:
         there = truth.T_world_base.inverse() @ SE2(x_m, y_m, 0.0)

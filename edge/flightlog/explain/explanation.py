@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from edge.core.geometry import SE2
-from edge.flightlog.explain.chain import drift, generation_of, people_in_view
-from edge.flightlog.explain.events import FALL, TIMEOUT, Event, find_events
+from edge.flightlog.explain.chain import drift, generation_of, people_ahead
+from edge.flightlog.explain.events import COLLISION, FALL, TIMEOUT, Event, find_events
 from edge.flightlog.explain.flight import Flight
 from edge.flightlog.explain.verdict import Verdict, decisive, judge, window
 from edge.flightlog.replay.records import RecordedTick
@@ -74,8 +74,10 @@ def _explained(flight: Flight, event: Event, cause: Event) -> Explanation:
     verdict = judge(flight, cause)
     if cause != event:
         at_s = flight.seconds(cause.begin_ns)
-        lost = "the run was lost with" if cause.final else "most time went to"
-        because = f"{lost} the {cause.kind} at {at_s:.0f} s ({cause.detail}): {verdict.because}"
+        lost = "the run was lost with the stop" if cause.final else f"most time went to the {cause.kind}"
+        if cause.kind == COLLISION:
+            lost = "no stop or detour came before it; the first collision,"
+        because = f"{lost} at {at_s:.0f} s ({cause.detail}): {verdict.because}"
         verdict = Verdict(verdict.cause, because, verdict.evidence, verdict.generation)
     ticks = flight.ticks_between(*window(cause)) or flight.ticks[-1:]
     if verdict.generation is not None:
@@ -122,13 +124,14 @@ def _scene(flight: Flight, at_ns: int) -> str:
     truth = flight.truth_at(at_ns)
     if truth is None:
         return ""
-    people = people_in_view(truth, 6.0)
-    nearest = f", the nearest at {people[0][0]:.1f} m" if people else ""
+    people = people_ahead(truth, 6.0)
+    count = "1 person" if len(people) == 1 else f"{len(people)} people"
+    nearest = f", possibly hidden, the nearest at {people[0][0]:.1f} m" if people else ""
     route = flight.route_at(at_ns)
     way = ""
     if route is not None and route.route_bearing_rad is not None:
         way = f"; the path to the goal, {route.route_m or 0:.0f} m, leads {math.degrees(route.route_bearing_rad):+.0f}°"
-    return f"; in truth {len(people)} people within 6 m in it{nearest}{way}"
+    return f"; in truth {count} within 6 m ahead{nearest}{way}"
 
 
 def _plan(tick: RecordedTick) -> str:

@@ -7,7 +7,7 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from edge.core.geometry import SE2
 from edge.flightlog.reader import RecordingError, read_messages
@@ -17,6 +17,11 @@ from edge.safety.faults.row import Action
 
 _ROUTE_NEAR_NS = 600_000_000
 """Largest distance in time of a shortest path from the instant that it is used for, ns."""
+ASPECTS: Final = (1 / 8, 8.0)
+"""Least and largest width by height of a camera's picture: drawn in another shape it would be empty or fill memory."""
+_MOST_NS: Final = 2**63
+"""Stamps are below it: monotonic ns in 64 bits. A larger one cannot be converted to s."""
+_MISSHAPEN: Final = (LookupError, TypeError, ValueError, AttributeError, OverflowError)
 
 
 @dataclass(frozen=True)
@@ -35,14 +40,14 @@ class Truth:
 
     @staticmethod
     def of_record(stamp_ns: int, record: Mapping[str, Any]) -> Truth:
-        """Read a `/truth` record. Raises LookupError, TypeError or ValueError."""
+        """Read a `/truth` record. Raises LookupError, TypeError, ValueError or OverflowError."""
         return Truth(
             stamp_ns,
             SE2(*(float(value) for value in record["pose"])),
             tuple((float(row[0]), float(row[1])) for row in record["people"]),
             tuple(str(label) for label in record["touching"]),
-            record.get("route_m"),
-            record.get("route_bearing_rad"),
+            _number_or_none(record.get("route_m")),
+            _number_or_none(record.get("route_bearing_rad")),
         )
 
 
@@ -138,8 +143,10 @@ def read_flight(path: Path) -> Flight:
     run, ticks, generations, frames_ns = read_run(path), [], {}, []
     for event in read_events(path):
         if isinstance(event, RecordedTick):
+            _check_stamps(path, "/tick", event.now_ns)
             ticks.append(event)
         elif isinstance(event, RecordedGeneration):
+            _check_stamps(path, "/semantic", event.ready_ns, *event.frames_ns)
             generations[event.number] = event
         else:
             frames_ns.append(event.stamp_ns)
@@ -156,13 +163,38 @@ def read_flight(path: Path) -> Flight:
             elif topic == "/fault":
                 _add_fault(faults, stamp_ns, payload)
             elif topic == "/result":
-                result = payload
+                result = _result(payload)
             elif topic == "/run" and payload.get("mount") is not None:
-                mount = Mount.of_record(payload["mount"])
-        except (LookupError, TypeError, ValueError) as error:
+                mount = _mount(payload["mount"])
+        except _MISSHAPEN as error:
             raise RecordingError(f"{path}: a {topic} record lacks or misshapes a field ({error!r})") from error
     truths.sort(key=lambda truth: truth.stamp_ns)
     return Flight(run.instruction, ticks, generations, faults, truths, result, mount, sorted(frames_ns))
+
+
+def _check_stamps(path: Path, topic: str, *stamps_ns: int) -> None:
+    """Raise RecordingError for a stamp that cannot be one."""
+    if not all(-_MOST_NS < stamp_ns < _MOST_NS for stamp_ns in stamps_ns):
+        raise RecordingError(f"{path}: a {topic} record has a stamp of more than 64 bits; expected monotonic ns")
+
+
+def _result(record: Any) -> dict[str, Any]:
+    """Return a `/result` record with a checked distance to the goal. Raises TypeError, ValueError or OverflowError."""
+    if not isinstance(record, dict):
+        raise TypeError(f"expected an object, found {type(record).__name__}")
+    return {**record, "ne_m": _number_or_none(record.get("ne_m"))}
+
+
+def _mount(record: Mapping[str, Any]) -> Mount:
+    """Read the camera's mount, one of a picture that can be drawn. Raises one of _MISSHAPEN."""
+    mount = Mount.of_record(record)
+    if mount.aspect is not None and not ASPECTS[0] <= mount.aspect <= ASPECTS[1]:
+        raise ValueError(f"mount.aspect: expected {ASPECTS[0]:g}..{ASPECTS[1]:g}, found {mount.aspect:g}")
+    return mount
+
+
+def _number_or_none(value: Any) -> float | None:
+    return None if value is None else float(value)
 
 
 def _add_fault(faults: list[FaultSpan], stamp_ns: int, record: Mapping[str, Any]) -> None:

@@ -11,6 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.core.geometry import SE2
+from edge.core.jpeg import jpeg_refusal
+from edge.flightlog.explain.flight import ASPECTS
 from edge.flightlog.replay.records import RecordedGeneration, RecordedTick
 from edge.flightlog.standard_messages import Mount
 from edge.odometry.camera_geometry import Attitude, FloorProjector
@@ -39,14 +41,18 @@ class Overlay:
         self._mount, self._width_px = mount, width_px
 
     def draw(self, jpeg: bytes, tick: RecordedTick | None, generation: RecordedGeneration | None) -> Picture | None:
-        """Return the picture, BGR, with the tick's plan and the generation's waypoints; None for a bad JPEG.
+        """Return the picture, BGR, with the tick's plan and the generation's waypoints.
 
+        None for a JPEG that is damaged or of a size that no camera has: decoding one could fill the memory.
         Without a tick, the picture is the generation's anchor: its waypoints are drawn as written, and no plan.
         """
-        image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR) if jpeg else None
+        refused = jpeg_refusal(jpeg) is not None
+        image = None if refused else cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
         if image is None:
             return None
         aspect = image.shape[1] / image.shape[0]
+        if not ASPECTS[0] <= aspect <= ASPECTS[1]:
+            return None
         if self._mount is not None and self._mount.aspect is not None:
             aspect = self._mount.aspect
         size = (self._width_px, 2 * round(self._width_px / aspect / 2))

@@ -17,7 +17,7 @@ from edge.flightlog.explain.chain import (
     drift,
     generation_of,
     leading_waypoint,
-    people_in_view,
+    people_ahead,
     waypoint_at,
 )
 from edge.flightlog.explain.events import COLLISION, DETOUR, FALL, STOP, Event
@@ -140,7 +140,7 @@ def _odometry(flight: Flight, tick: RecordedTick) -> Verdict | None:
 
 
 def _person(flight: Flight, event: Event, ticks: Sequence[RecordedTick]) -> Verdict | None:
-    """Judge a contact with a person: standing robot, unseen person, late text, or a text that denies the person."""
+    """Judge a contact with a person: standing robot, late text, or a text that names no person."""
     if not _drives(ticks[-10:]):
         return Verdict(PERSON, "the robot stood; the person came to it", _motion(ticks[-10:]))
     generation = generation_of(flight, ticks[-1])
@@ -148,15 +148,15 @@ def _person(flight: Flight, event: Event, ticks: Sequence[RecordedTick]) -> Verd
     if generation is None or truth is None:
         return None
     claimed = parse_text(generation.text).people
-    seen = people_in_view(truth, NEAR_M)
+    ahead = people_ahead(truth, NEAR_M)
     age_s = (event.begin_ns - generation.frames_ns[-1]) / 1e9
-    if seen and not claimed:
-        numbers = f"{len(seen)} people within {NEAR_M:g} m in the picture, the nearest {seen[0][0]:.1f} m"
-        return Verdict(
-            REASONING, "the text denies a person in the picture", (numbers, _line(generation.text, "Motion"))
-        )
-    if not seen:
-        numbers = f"nobody within {NEAR_M:g} m in the picture {age_s:.1f} s before the contact"
+    if ahead and not claimed:
+        count = "1 person" if len(ahead) == 1 else f"{len(ahead)} people"
+        numbers = f"{count} within {NEAR_M:g} m ahead, the nearest {ahead[0][0]:.1f} m away"
+        because = f"the text names no person, and one was within {NEAR_M:g} m ahead, possibly hidden"
+        return Verdict(REASONING, because, (numbers, _line(generation.text, "Motion")))
+    if not ahead:
+        numbers = f"nobody within {NEAR_M:g} m ahead {age_s:.1f} s before the contact"
         return Verdict(LATE, "the person came after the picture that the text describes", (numbers,))
     return None
 
@@ -181,24 +181,26 @@ def _text(flight: Flight, generation: RecordedGeneration) -> Verdict | None:
     if point is None:
         return None
     if route is not None and route.route_bearing_rad is not None:
-        apart = wrap_angle(bearing_rad(point) - route.route_bearing_rad)
-        if abs(apart) > WRONG_WAY_RAD:
-            numbers = f"waypoints {_side(bearing_rad(point))}, shortest path {_side(route.route_bearing_rad)}"
-            return Verdict(
-                REASONING, _wrong_way(generation, route.route_bearing_rad), (numbers, *lines), generation.number
-            )
+        waypoint_rad, route_rad = bearing_rad(point), route.route_bearing_rad
+        if abs(wrap_angle(waypoint_rad - route_rad)) > WRONG_WAY_RAD:
+            numbers = f"waypoints {_side(waypoint_rad)}, shortest path {_side(route_rad)}"
+            because = _wrong_way(generation, waypoint_rad, route_rad)
+            return Verdict(REASONING, because, (numbers, *lines), generation.number)
     plan = parse_text(generation.text).plan
     if plan is not None and isinstance(plan.action, Turn) and plan.action.distance_m <= 1:
         side = {LEFT: 1.0, RIGHT: -1.0}.get(plan.action.side, 0.0)
         last = (parse_waypoints(generation.text) or (point,))[-1]
         if side * bearing_rad(last) < -math.radians(20):
             return Verdict(REASONING, "the text contradicts itself: its plan and its waypoints turn to different sides",
-                           (f"last waypoint {_side(bearing_rad(last))}", *lines))  # fmt: skip
+                           (f"last waypoint {_side(bearing_rad(last))}", *lines), generation.number)  # fmt: skip
     return None
 
 
-def _wrong_way(generation: RecordedGeneration, route_rad: float) -> str:
-    """Return what the text got wrong about the route, for waypoints that lead elsewhere than the shortest path."""
+def _wrong_way(generation: RecordedGeneration, waypoint_rad: float, route_rad: float) -> str:
+    """Return what the text got wrong about the route, for waypoints that lead elsewhere than the shortest path.
+
+    `waypoint_rad`, `route_rad`: directions of both, seen from the robot at the anchor, left positive.
+    """
     plan = parse_text(generation.text).plan
     if plan is None:
         return "the waypoints lead off the path to the goal, and the text states no plan"
@@ -210,9 +212,12 @@ def _wrong_way(generation: RecordedGeneration, route_rad: float) -> str:
         return "the text goes straight on, and the path turns"
     if abs(route_rad) < _STRAIGHT_RAD:
         return "the text turns where the path goes straight on: too early, or into a wrong opening"
-    if (plan.action.side == LEFT) == (route_rad > 0):
-        return "the text turns too late: the path turns to that side already"
-    return "the text turns to the wrong side"
+    side = 1 if plan.action.side == LEFT else -1
+    if side * route_rad < 0:
+        return "the text turns to the wrong side"
+    if side * waypoint_rad > side * route_rad:
+        return "the text turns too early or too far: the path turns less to that side"
+    return "the text turns too late: the path turns to that side already"
 
 
 def _plan_against_text(flight: Flight, ticks: Sequence[RecordedTick]) -> Verdict | None:
@@ -331,7 +336,7 @@ def _standing_plan(flight: Flight, ticks: Sequence[RecordedTick]) -> Verdict | N
     lines = (_line(generation.text, "Motion"), _line(generation.text, "Plan"))
     waits = parts.plan is not None and parts.plan.waits
     truth = flight.truth_at(generation.frames_ns[-1])
-    if waits and truth is not None and not people_in_view(truth, 2 * NEAR_M):
+    if waits and truth is not None and not people_ahead(truth, 2 * NEAR_M):
         return Verdict(REASONING, "the text waits for a person, and nobody is there", lines)
     if waits:
         return Verdict(PERSON, "the text lets a person pass", lines)

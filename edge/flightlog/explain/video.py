@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 import sys
 import textwrap
@@ -33,6 +34,10 @@ PANEL_PX: Final = 160
 CODEC: Final = "mp4v"
 _MAX_TEXT_LINES: Final = 6
 _TEXT_CHARS: Final = 88
+_SINGLE_HZ: Final = 10.0
+"""Rate of a video of one picture, Hz."""
+_MOST_HZ: Final = 240.0
+"""Rate above which the stamps cannot be a camera's, Hz."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -86,29 +91,50 @@ def draw_page(overlay: Overlay, flight: Flight, frame: RecordedFrame) -> Picture
     return np.vstack((picture, panel))
 
 
-def write_video(path: Path, flight: Flight, out: Path, from_s: float, to_s: float) -> int:
-    """Write the video, whole or not at all; return its number of pictures. Raises RecordingError, OSError."""
+def write_video(path: Path, flight: Flight, out: Path, from_s: float, to_s: float) -> tuple[int, int]:
+    """Write the video, whole or not at all; return the numbers of its pictures and of those that cannot be decoded.
+
+    Raises RecordingError, OSError.
+    """
+    stamps = [at_ns for at_ns in flight.frames_ns if from_s <= flight.seconds(at_ns) <= to_s]
+    if not stamps:
+        raise RecordingError(f"{path}: no picture between --from and --to; expected some in {len(flight.frames_ns)}")
+    rate_hz = _rate_hz(path, stamps)
     partial = out.with_name(f"{out.stem}.partial{out.suffix}")  # OpenCV takes the format from the suffix
     writer: cv2.VideoWriter | None = None
-    stamps = [at_ns for at_ns in flight.frames_ns if from_s <= flight.seconds(at_ns) <= to_s]
     count = 0
     try:
         for _, page in pages(path, flight, from_s, to_s):
             if writer is None:
                 height, width = page.shape[:2]
-                rate_hz = 1e9 * (len(stamps) - 1) / (stamps[-1] - stamps[0]) if len(stamps) > 1 else 10.0
                 writer = cv2.VideoWriter(str(partial), cv2.VideoWriter.fourcc(*CODEC), rate_hz, (width, height))
                 if not writer.isOpened():
                     raise OSError(f"{out}: OpenCV cannot write a video here; expected a writable folder and .mp4")
             writer.write(page)
             count += 1
+        if writer is None:
+            raise RecordingError(f"{path}: none of the {len(stamps)} pictures between --from and --to can be decoded")
+        writer.release()  # writes the end of the file
+        partial.replace(out)
     finally:
         if writer is not None:
             writer.release()
-    if not count:
-        raise RecordingError(f"{path}: no picture between --from and --to; expected some in {len(flight.frames_ns)}")
-    partial.replace(out)
-    return count
+        with contextlib.suppress(OSError):  # its error would hide the one that ended the video
+            partial.unlink(missing_ok=True)
+    return count, len(stamps) - count
+
+
+def _rate_hz(path: Path, stamps_ns: Sequence[int]) -> float:
+    """Return the pictures' mean rate, Hz. Raises RecordingError for pictures that are not one after the other."""
+    if len(stamps_ns) == 1:
+        return _SINGLE_HZ
+    span_ns = stamps_ns[-1] - stamps_ns[0]
+    rate_hz = 1e9 * (len(stamps_ns) - 1) / max(1, span_ns)
+    if rate_hz > _MOST_HZ:
+        raise RecordingError(
+            f"{path}: {len(stamps_ns)} pictures within {span_ns} ns; expected at most {_MOST_HZ:g} a second"
+        )
+    return rate_hz
 
 
 _print = messages("edge-replay video")
@@ -126,8 +152,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         _print(
             f"{args.file}: names no camera mount, so plan and waypoints are not drawn; add [mount] to the robot file"
         )
-    count = write_video(args.file, flight, args.out, args.from_s, args.to_s)
-    _print(f"{args.out}: {count} pictures")
+    count, left_out = write_video(args.file, flight, args.out, args.from_s, args.to_s)
+    _print(f"{args.out}: {count} pictures" + (f", without {left_out} that cannot be decoded" if left_out else ""))
     return EXIT_DONE
 
 

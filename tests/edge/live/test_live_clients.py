@@ -6,26 +6,27 @@ import asyncio
 import json
 import socket
 from collections.abc import Awaitable, Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
 from aiohttp import WSServerHandshakeError
 from aiohttp.test_utils import TestClient, TestServer
 
-from edge.live import wire
+from edge.live import stop, wire
 from edge.live.server import LiveServer
 from tests.edge.live.test_live_view import tick
 
 Client = TestClient[Any, Any]
 
 
-def serve(datagrams: list[bytes], body: Callable[[Client], Awaitable[Any]]) -> Any:
+def serve(datagrams: list[bytes], body: Callable[[Client], Awaitable[Any]], bridge: Path | None = None) -> Any:
     """Give a server its runner's datagrams; return what `body` finds as a client that comes later."""
 
     async def run() -> Any:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with ours, theirs:
-            server = LiveServer(wire.ViewConfig("127.0.0.1", 0, "t", None), ours)
+            server = LiveServer(wire.ViewConfig("127.0.0.1", 0, "t", bridge), ours)
             for data in datagrams:
                 server.take(data)
             async with TestClient(TestServer(server.app())) as client:
@@ -108,3 +109,17 @@ def test_foxglove_without_the_token_is_refused_from_its_own_origin() -> None:
         return int(response.status)
 
     assert serve([], status) == 403
+
+
+@pytest.mark.parametrize(("datagrams", "stamp_ns"), [([record("/run", {})], 5), ([], None)])
+def test_an_answer_to_a_stop_names_its_run(
+    datagrams: list[bytes], stamp_ns: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A page may show another run by then: the next one answers at the same address."""
+    monkeypatch.setattr(stop, "operate", lambda *_, **__: (0, {}))
+
+    async def press(client: Client) -> Any:
+        return await (await client.post("/stop", headers={"Authorization": "Bearer t"})).json()
+
+    answer = serve(datagrams, press, Path("b.sock"))
+    assert answer["stopped"] is True and answer["run"] == stamp_ns

@@ -122,6 +122,38 @@ def test_a_late_confirmation_of_the_operators_stop_counts(desk: Desk) -> None:
     assert answer["stopped"] and answer["latched"] and len(desk.requested_s) == 1
 
 
+STOPPED_AND_MOVING: dict[str, object] = {"state": "stopped", "blocked_by": "estop", "motion": "moving"}
+"""Status of a bridge that an operator has stopped and whose robot does not stand yet."""
+
+
+@pytest.mark.parametrize(
+    ("operators", "latched", "said"),
+    [
+        ((1, STOPPED_AND_MOVING), True, "Before it moves again: edge-bridge arm"),
+        ((1, {"error": "not confirmed"}), False, "It is unknown whether the operator's stop is in effect"),
+        ((1, {**STOPPED_AND_MOVING, "blocked_by": "none"}), False, "a new run may arm"),
+        ((3, {"error": "no bridge"}), False, "No operator's stop was possible: a new run can arm"),
+    ],
+    ids=["in effect", "no status", "not in effect", "no bridge"],
+)
+def test_the_runners_confirmation_says_whether_the_operators_stop_is_in_effect(
+    desk: Desk, operators: tuple[int, dict[str, object]], latched: bool, said: str
+) -> None:
+    """A robot that comes to rest after the operator's 2 s: the stop is in effect, and only the runner confirms it."""
+    desk.operator(lambda *_, **__: operators)
+    desk.confirms = True
+    answer = desk.run(press)
+    assert answer["stopped"] and answer["latched"] is latched and said in answer["text"]
+    assert latched or "edge-bridge arm" not in answer["text"]
+
+
+def test_a_stop_in_effect_of_a_robot_that_still_moves_is_not_confirmed(desk: Desk) -> None:
+    desk.operator(lambda *_, **__: (1, STOPPED_AND_MOVING))
+    desk.confirms = False
+    answer = desk.run(press)
+    assert not answer["stopped"] and answer["latched"] and "remote" in answer["text"]
+
+
 def test_without_any_confirmation_it_says_so(desk: Desk) -> None:
     desk.operator(lambda *_, **__: (3, {}))
     desk.confirms = False

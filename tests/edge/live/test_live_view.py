@@ -156,6 +156,33 @@ def test_the_metrics_are_those_of_the_newest_records() -> None:
     assert text.endswith("# EOF\n")
 
 
+def samples(metrics: Metrics, name: str) -> list[str]:
+    """The lines of one metric."""
+    return [line for line in metrics.text(0).decode().splitlines() if line.startswith(f"tic_vla_{name}")]
+
+
+def test_a_meter_that_is_lost_leaves_no_power_behind() -> None:
+    """Without a sample the record's power is null and its tag is another (`edge.power.monitor`)."""
+    metrics = Metrics()
+    metrics.take("/power", {"total_w": 14.0, "budget_w": 25.0, "temperature_c": 60.0, "tagged": "measured"})
+    metrics.take("/power", {"total_w": None, "budget_w": None, "temperature_c": None, "tagged": "modelled"})
+    assert samples(metrics, "power_watts") == ['tic_vla_power_watts{tagged="modelled"} NaN']
+    assert samples(metrics, "temperature_celsius") == ["tic_vla_temperature_celsius NaN"]
+    assert samples(metrics, "power_budget_watts") == ["tic_vla_power_budget_watts NaN"]
+
+
+@pytest.mark.parametrize("state", [None, [None, 0.0, None]])
+def test_a_tick_without_odometry_leaves_no_motion_and_no_delay_behind(state: list[float | None] | None) -> None:
+    metrics = Metrics()
+    metrics.take("/tick", tick())
+    metrics.take("/tick", tick(state=state, delay_s=None, frame_age_ms=None))
+    assert 'tic_vla_speed_mps{kind="measured"} NaN' in samples(metrics, "speed_mps")
+    assert 'tic_vla_speed_mps{kind="commanded"} 0.5' in samples(metrics, "speed_mps")
+    assert 'tic_vla_yaw_rate_radps{kind="measured"} NaN' in samples(metrics, "yaw_rate_radps")
+    assert samples(metrics, "delay_seconds") == ["tic_vla_delay_seconds NaN"]
+    assert samples(metrics, "frame_age_seconds") == ["tic_vla_frame_age_seconds NaN"]
+
+
 class TestFoxgloveProtocol:
     def test_a_message_goes_out_under_the_number_that_the_client_chose(self) -> None:
         subscriptions = Subscriptions()

@@ -106,7 +106,7 @@ def test_a_connection_without_data_for_10_s_is_replaced() -> None:
 def test_a_connection_with_data_stays() -> None:
     scenario = """
         sockets[0].open();
-        for (let k = 1; k <= 30; k++) { tick(k); await advance(1000); }
+        for (let k = 1; k <= 30; k++) { tick(k * 1e9); await advance(1000); }
         found.push(sockets.length, text("link"));
     """
     assert watch(scenario) == [1, "live"]
@@ -116,9 +116,43 @@ def test_the_old_pose_that_a_new_connection_begins_with_is_not_live() -> None:
     scenario = """
         sockets[0].open(); tick(1); await advance(11000);
         sockets[1].open(); tick(1); await advance(200); found.push(text("link"));
-        tick(2); found.push(text("link"));
+        tick(11.2e9); found.push(text("link"));
     """
     assert watch(scenario) == ["no data for 2 s", "live"]
+
+
+def test_old_data_is_not_live() -> None:
+    """A slow network delivers new poses, each 3 s later than the first ones came."""
+    scenario = """
+        sockets[0].open(); run(1);
+        for (let k = 1; k <= 5; k++) { tick(k * 1e9); await advance(1000); }
+        found.push(text("link"));
+        await advance(3000);
+        const shown = () => found.push(text("link"), elements.link.className);
+        for (let k = 6; k <= 8; k++) { tick(k * 1e9); shown(); await advance(1000); }
+        tick(12e9); shown();
+    """
+    assert watch(scenario) == ["live", *["data is 3.0 s old", "lost"] * 3, "live", "quiet"]
+
+
+def test_a_clock_that_drifts_and_a_robot_that_restarts_keep_data_live() -> None:
+    scenario = """
+        sockets[0].open(); run(1);
+        for (let k = 1; k <= 40; k++) { tick(k * 1e12 * (1 - 5e-5)); now += 1e6; }
+        found.push(text("link"));
+        await advance(11000); sockets.at(-1).open(); run(2); tick(3e9); found.push(text("link"));
+    """
+    assert watch(scenario) == ["live", "live"]
+
+
+def test_the_link_is_stated_beside_the_stop_button_too() -> None:
+    scenario = """
+        sockets[0].open(); tick(1e9); await advance(100);
+        const shown = () => found.push(text("link-beside-stop"), elements["link-beside-stop"].className);
+        shown(); await advance(3000); shown(); sockets[0].lose(); shown();
+    """
+    lost = ["no data for 2 s", "lost", "connection lost, trying again", "lost"]
+    assert watch(scenario) == ["live", "quiet", *lost]
 
 
 def test_nothing_of_a_run_stays_when_the_next_one_drives() -> None:
@@ -140,13 +174,41 @@ def test_nothing_of_a_run_stays_when_the_next_one_drives() -> None:
     assert next_run == ["", "", True, 0]
 
 
-def test_an_answer_to_an_earlier_runs_stop_is_not_shown_in_the_next_one() -> None:
+@pytest.mark.parametrize("stopped_run", [2, None], ids=["that run", "a run not known yet"])
+def test_a_stop_under_way_is_answered_although_the_next_run_appears(stopped_run: int | None) -> None:
+    """The page had no connection, the next run was already driving, and its record came after the press."""
+    scenario = """
+        sockets[0].open(); run(1); sockets[0].lose();
+        elements.stop.onclick(); await advance(1100); sockets[1].open(); run(2); found.push(text("answer"));
+        await advance(1000); found.push(text("answer"));
+        stops[0]({ stopped: true, text: "stopped: it stands", run: STOPPED_RUN });
+        await advance(100); found.push(text("answer"), elements.answer.className);
+    """
+    assert watch(scenario.replace("STOPPED_RUN", json.dumps(stopped_run))) == [
+        "stopping …", "not confirmed yet: take the robot's remote", "stopped: it stands", "cleared",
+    ]  # fmt: skip
+
+
+def test_a_stop_under_way_that_fails_says_so_although_the_next_run_appears() -> None:
+    scenario = """
+        sockets[0].open(); run(1); sockets[0].lose();
+        elements.stop.onclick(); await advance(1100); sockets[1].open(); run(2); await advance(8000);
+        found.push(text("answer"));
+        run(3); found.push(text("answer"));
+    """
+    failed, next_run = watch(scenario)
+    assert failed.startswith("NOT CONFIRMED (timed out)") and next_run == ""
+
+
+def test_an_answer_to_an_earlier_runs_stop_is_not_shown_as_the_next_ones() -> None:
     scenario = """
         sockets[0].open(); run(1); elements.stop.onclick(); await advance(100);
         sockets[0].lose(); await advance(1100); sockets[1].open(); run(2);
-        stops[0]({ stopped: true, text: "stopped: it stands" }); await advance(5000); found.push(text("answer"));
+        stops[0]({ stopped: true, text: "stopped: it stands", run: 1 }); await advance(5000);
+        found.push(text("answer"), elements.answer.className);
     """
-    assert watch(scenario) == [""]
+    expected = "For the run before this one: stopped: it stands. To stop this run, press STOP again"
+    assert watch(scenario) == [expected, "STOP"]
 
 
 def test_a_connection_that_comes_back_within_a_run_keeps_the_answer() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -28,6 +29,10 @@ from tests.support.runner import explained_flights as flights
 from tests.support.runner.explained_flights import SPEED_MPS, STRAIGHT, TEXT, TURN_LEFT, at
 
 TOUCH_S = 10.0
+LEAN_LEFT = "waypoints: (1.5, 0.7) (2.5, 1.5) (3.5, 2.2)"
+SHARP_LEFT = "waypoints: (0.5, 2.8) (0.6, 4.0) (0.6, 5.0)"
+"""Waypoints 80° left."""
+SHARP_RIGHT = "waypoints: (0.5, -2.8) (0.6, -4.0) (0.6, -5.0)"
 
 
 def only(flight: Flight, kind: str) -> Verdict:
@@ -91,6 +96,17 @@ def test_a_contact_with_a_person_asks_whether_the_picture_showed_one(
     assert only(flight, COLLISION).cause == cause
 
 
+def test_a_person_whom_a_wall_may_hide_is_not_said_to_be_in_the_picture() -> None:
+    """The truth has places of people, and no walls."""
+    person = (SPEED_MPS * 9.0 + 2.0, 0.3)
+    flight = flights.flight(truths=touched("person", people=(person,)))  # type: ignore[arg-type]
+    (found,) = explain(flight)
+    assert found.verdict.because == "the text names no person, and one was within 3 m ahead, possibly hidden"
+    assert found.verdict.evidence[0] == "1 person within 3 m ahead, the nearest 2.0 m away"
+    saw = dict(found.steps)["The camera saw"]
+    assert "in truth 1 person within 6 m ahead, possibly hidden, the nearest at 2.0 m" in saw
+
+
 def test_a_contact_with_a_person_whom_the_text_named_is_the_action_experts_whatever_the_route() -> None:
     person, named = (SPEED_MPS * 9.0 + 2.0, 0.3), TEXT.replace("nobody near", "person ahead 2 m standing")
     truths = touched("person", people=(person,), route_bearing_rad=1.5)
@@ -112,6 +128,9 @@ def test_a_person_who_walks_into_a_standing_robot_is_the_cause() -> None:
         ("turn left into the room in 9 m", STRAIGHT, 1.3, "turns too late"),
         ("turn right into the room in 9 m", STRAIGHT, 1.3, "wrong side"),
         ("turn left into the room in 1 m", TURN_LEFT, 0.0, "wrong opening"),
+        ("turn left into the room in 1 m", SHARP_LEFT, math.radians(30), "turns too early or too far"),
+        ("turn right into the room in 1 m", SHARP_RIGHT, math.radians(-30), "turns too early or too far"),
+        ("turn left into the room in 1 m", SHARP_RIGHT, math.radians(30), "turns too late"),
         ("turn back", STRAIGHT, 1.3, "turns back"),
     ],
 )
@@ -127,6 +146,20 @@ def test_a_detour_on_waypoints_off_the_shortest_path_is_the_texts(
 
     verdict = only(flights.flight(texts=lambda n: text if n >= 5 else TEXT, truths=away), DETOUR)
     assert (verdict.cause, because in verdict.because) == (REASONING, True)
+
+
+def test_a_text_that_contradicts_itself_is_the_one_that_is_shown() -> None:
+    """The text in force where the detour begins is right; the one 2 s before it is not."""
+    wrong = f"Motion: nobody near.\nPlan: turn right into the room in 1 m.\n{LEAN_LEFT}"
+
+    def away(second: float) -> Truth:
+        route_m = 30.0 - SPEED_MPS * second if second < 10 else 25.0 + (second - 10) * SPEED_MPS
+        return flights.truth(second, route_m=route_m)
+
+    flight = flights.flight(texts=lambda n: wrong if n == 4 else TEXT, truths=away)
+    (found,) = [each for each in explain(flight) if each.event.kind == DETOUR]
+    assert found.verdict.because.startswith("the text contradicts itself")
+    assert (found.verdict.generation, found.generation, found.text) == (4, 4, wrong)
 
 
 def test_a_plan_that_leaves_the_waypoints_is_the_action_experts() -> None:
@@ -209,6 +242,14 @@ def test_a_timeout_is_explained_by_the_event_that_took_longest() -> None:
     assert [each.event.kind for each in found] == [STOP, TIMEOUT]
     assert found[1].refers and found[1].verdict.cause == LIMITED
     assert deciding(flight, found) is found[0]
+
+
+def test_a_timeout_after_a_collision_alone_does_not_say_that_the_collision_took_the_time() -> None:
+    flight = flights.flight(truths=touched("plant"), result={"end": "timeout", "ne_m": 9.0})  # type: ignore[arg-type]
+    found = explain(flight)
+    assert [each.event.kind for each in found] == [COLLISION, TIMEOUT]
+    because = found[1].verdict.because
+    assert because.startswith("no stop or detour came before it; the first collision, at 10 s (plant): text and")
 
 
 def test_what_no_rule_explains_says_so() -> None:
