@@ -31,10 +31,10 @@ EXAMPLES: Final = """examples:
   edge-train collect --preset nano --out out/run                   a single stage
   edge-train sft --out out/run --set sft.epochs=12
   torchrun --nproc-per-node 2 -m tools.train.cli sft --out out/run           also: encoder, imitate, dagger, all
-  edge-train imitate --out out/run --delay-profile orin.latency.json
+  edge-train all --preset nano --out out/mine-run --delay-profile orin.latency.json
   edge-train imitate --from out/run --variant no-latency --out out/no-latency
   edge-train dagger --preset nano --checkpoint out/run/model.safetensors --after imitate --out out/more
-  edge-train card --out out/run --scores out/bench/result.json --ship export/weights    model card, weights to publish
+  edge-train card --out out/run --scores out/bench/result.json --ship out/run/ship    model card, weights to publish
 
 stages: collect (the expert drives), encoder (vision encoder on simulator labels), sft (reasoning text and waypoints),
 imitate (actions under delay), dagger (the policy drives, the expert relabels, imitation continues), rl (PPO),
