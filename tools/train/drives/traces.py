@@ -242,8 +242,8 @@ def _along(pose: SE2, step: Step) -> float:
 
 
 def _drives_backwards(pose: SE2, step: Step, *, missed: bool) -> bool:
-    """Return whether the robot comes back along the leg to a counted opening that it has driven past (`missed`)."""
-    return step.ordinal > 0 and _along(pose, step) < (0.0 if missed else _AGAINST)
+    """Return whether the robot comes back to a counted opening that it has driven past (`missed`): not heading on."""
+    return step.ordinal > 0 and _along(pose, step) < (-_AGAINST if missed else _AGAINST)
 
 
 def _seen_side(step: Step, *, backwards: bool) -> str:
