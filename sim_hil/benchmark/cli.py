@@ -95,7 +95,8 @@ def _run(args: argparse.Namespace) -> int:
             raise ConditionsError(f"--episodes: expected an episode of the {robot.hil_robot}, found none")
     episodes = list(reworded(episodes, conditions, lambda: load_suite(args.suite)))
     run = BenchRun.plan(args.suite, episodes, conditions)
-    with _output_directory(args.out) as folder, _live_view(args, conditions.clock) as live, stop_signals() as stop:
+    # Signals outermost: a second one must not end the process before the temporary folder is removed.
+    with stop_signals() as stop, _output_directory(args.out) as folder, _live_view(args, conditions.clock) as live:
         done = len(read_results(folder)) if args.resume else 0
         with BenchProgress(len(run.episodes), done, blind=is_fresh(args.suite)) as progress:
             execution = execute(

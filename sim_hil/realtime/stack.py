@@ -89,10 +89,14 @@ class Stack:
         self.faults: FaultClient | None = None
         self._children = Children(options.folder, grace_s=GRACE_S)
         self._sockets = Path(tempfile.mkdtemp(prefix="tic-"))
-        self._address = RunAddress.free(self._sockets, options.domain)
         file = options.folder / "robot.toml"
-        self.robot_file = options.robot.write_file(file, self._address, options.speed_limit_mps)
-        """The run's own robot file."""
+        try:
+            self._address = RunAddress.free(self._sockets, options.domain)
+            self.robot_file = options.robot.write_file(file, self._address, options.speed_limit_mps)
+            """The run's own robot file."""
+        except BaseException:
+            shutil.rmtree(self._sockets, ignore_errors=True)
+            raise
 
     def __enter__(self) -> Stack:
         return self

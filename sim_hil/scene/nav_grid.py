@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import dijkstra
+from scipy.sparse.csgraph import connected_components, dijkstra
 
-from sim_hil.scene.scene import Box, Scene, Terrain, Vec2
+from sim_hil.scene.scene import Box, Scene, SceneError, Terrain, Vec2
 
 Array = NDArray[np.float64]
 
@@ -42,7 +42,8 @@ class NavGrid:
 
     `height_m`: objects that begin above this height are no obstacles. `max_step_m`: higher steps of the ground are
     obstacles. `clearances`: distance from each cell's centre to the nearest obstacle [rows, columns], m, capped,
-    negative inside one. `free`: whether the robot's centre may be in each cell [rows, columns]. Raises ValueError.
+    negative inside one. `free`: whether the robot's centre may be in each cell [rows, columns]. Raises SceneError for a
+    scene without room, ValueError for other values.
     """
 
     def __init__(
@@ -64,7 +65,10 @@ class NavGrid:
         self._keep_off_edges(scene.terrain, max_step_m)
         self.free = self.clearances >= clearance_m - _HAIR_M
         if not self.free.any():
-            raise ValueError(f"navigation grid: scene {scene.name} has no room for a clearance of {clearance_m} m")
+            raise SceneError(
+                f"scene {scene.name}: expected room for a clearance of {clearance_m} m, found none; enlarge the floor "
+                "or move its objects apart"
+            )
         # Row and column of the nearest free cell of each cell [2, rows, columns].
         self._nearest = distance_transform_edt(~self.free, return_distances=False, return_indices=True)
         self._trees: dict[tuple[int, int], tuple[Array, NDArray[np.int32]]] = {}
@@ -157,6 +161,25 @@ class NavGrid:
             return (x_m, y_m)
         point = self.centre(*self.free_cell(x_m, y_m))
         return point if hypot(point[0] - x_m, point[1] - y_m) <= _SNAP_M else None
+
+    @cached_property
+    def _spaces(self) -> NDArray[np.int32]:
+        """Number of the connected space that each free cell belongs to [n]."""
+        return np.asarray(connected_components(self.graph[2], directed=False)[1])
+
+    def space(self, x_m: float, y_m: float) -> int:
+        """Return the number of the connected space of the free cell nearest to a point; paths stay in one space."""
+        return int(self._spaces[self.graph[0][self.free_cell(x_m, y_m)]])
+
+    def nearest_in_largest_space(self, x_m: float, y_m: float) -> Vec2:
+        """Return the nearest cell's centre in the largest connected space.
+
+        The nearest free cell may lie in a pocket between furniture, from which no path leads anywhere.
+        """
+        cells = self.graph[1][self._spaces == np.bincount(self._spaces).argmax()]
+        centres = np.array(self.origin_m) + (cells[:, ::-1] + 0.5) * self.resolution_m
+        x, y = centres[int(np.hypot(*(centres - (x_m, y_m)).T).argmin())]
+        return (float(x), float(y))
 
     def is_free(self, x_m: float, y_m: float) -> bool:
         """Return whether the robot's centre may be at a point."""

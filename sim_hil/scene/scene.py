@@ -38,6 +38,8 @@ __all__ = [
 ]  # fmt: skip
 
 SCENES = Path(__file__).parents[1] / "scenes"
+MAX_FLOOR_M2 = 250_000.0
+"""Largest floor, m²: navigation grids of 25 million cells take 1 GB. The largest shipped one has 7200 m²."""
 SKY: Vec3 = (0.60, 0.76, 0.92)
 # Sections of a scene file in the order in which they are written; the keys are the fields of their class.
 _SECTIONS: dict[str, type[Any]] = {
@@ -77,6 +79,8 @@ class Scene:
         (x0, y0), (x1, y1) = self.floor_min_m, self.floor_max_m
         if x0 >= x1 or y0 >= y1:
             raise SceneError("floor: min_m must lie below max_m")
+        if (x1 - x0) * (y1 - y0) > MAX_FLOOR_M2:
+            raise SceneError(f"floor: expected at most {MAX_FLOOR_M2:g} m², found {(x1 - x0) * (y1 - y0):g} m²")
         for what, (x, y) in (("start", self.start[:2]), ("goal_xy", self.goal_xy)):
             if not (x0 <= x <= x1 and y0 <= y <= y1):
                 raise SceneError(f"{what}: ({x}, {y}) is not on the floor")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ from edge.core.cli import (
     EXIT_INTERRUPTED,
     EXIT_REFUSED,
     command_line,
+    describe_os_error,
     stop_signals,
     write_result,
 )
@@ -70,10 +72,23 @@ def main(argv: Sequence[str] | None = None) -> int:
                 )  # fmt: skip
         except (StepError, ValueError) as error:
             finished, failure = False, str(error)
-        result = soak_result(soak, options, budget, menu, finished=finished)
-        write_result(str(soak.path / "result.json"), result)
-        write_result(args.json, result)
-        _print(str(write_report(soak, result)))
+        except OSError as error:
+            finished, failure = False, describe_os_error(error, f"--out {soak.path}")
+        try:
+            # Reads the files of every leg, so nothing is written into a folder that was deleted meanwhile.
+            result = soak_result(soak, options, budget, menu, finished=finished)
+            if not soak.path.is_dir():
+                raise FileNotFoundError(errno.ENOENT, "the folder was deleted", str(soak.path))
+            write_result(str(soak.path / "result.json"), result)
+            write_result(args.json, result)
+            _print(str(write_report(soak, result)))
+        except OSError as error:
+            found = describe_os_error(error, "a file of the soak")
+            return _report_error(
+                f"--out {soak.path}: expected the soak's files to stay until its end, found: {found}; "
+                "start again with another folder",
+                EXIT_CHECK_FAILED,
+            )
         if args.json != "-":
             sys.stdout.write(summary_lines(result))
     if failure:

@@ -105,9 +105,10 @@ class Leg:
                 "robot": self.options.stack.robot.name,
             },
         }
-        (folder / LEG).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
         events, samples = (folder / name for name in (EVENTS, SAMPLES))
-        with events.open("a") as self._events, samples.open("a") as self._samples, self._stack:
+        # The stack first: it removes its sockets also where a file of the leg cannot be written.
+        with self._stack, events.open("a") as self._events, samples.open("a") as self._samples:
+            (folder / LEG).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
             self._begin_ns = time.monotonic_ns()
             self._note("leg_begin", scene=self.options.stack.scene, people=self.options.stack.people)
             if self._menu is not None:

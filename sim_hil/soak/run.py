@@ -112,6 +112,11 @@ class SoakFolder:
             before = read_json(path / CONFIG)
         except (OSError, ValueError) as error:
             raise SoakInputError(f"--resume: {path} contains no soak to continue ({error})") from error
+        if not isinstance(before, dict):
+            raise SoakInputError(
+                f"--resume: {path / CONFIG}: expected an object, found {type(before).__name__}; restore the file, or "
+                "begin a new soak in another folder"
+            )
         now = options.config()
         differ = [key for key in now if before.get(key) != now[key]]
         if differ:
@@ -124,15 +129,26 @@ class SoakFolder:
 
     @staticmethod
     def open(path: Path) -> SoakFolder:
-        """Open a folder and analyse unfinished legs. Raises OSError."""
+        """Open a folder and analyse unfinished legs. Raises OSError, or SoakInputError for damaged files."""
         found = SoakFolder(path)
         for folder in sorted((path / LEGS).iterdir()):
-            if (folder / ANALYSIS).exists():
-                found.legs.append(read_json(folder / ANALYSIS))
-            elif (folder / LEG).exists() and (folder / SAMPLES).exists():
-                found.legs.append(analyse(folder))  # the soak was killed during this leg
-            else:
-                shutil.rmtree(folder)  # killed before the first sample
+            try:
+                if (folder / ANALYSIS).exists():
+                    leg = read_json(folder / ANALYSIS)
+                elif (folder / LEG).exists() and (folder / SAMPLES).exists():
+                    leg = analyse(folder)  # the soak was killed during this leg
+                else:
+                    shutil.rmtree(folder)  # killed before the first sample
+                    continue
+                # Whatever the verdict reads is read once here, where an error can name the folder.
+                _leg_result(leg)
+                measures([leg], [list(read_lines(folder / SAMPLES))])
+            except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
+                raise SoakInputError(
+                    f"{folder}: expected the files of a leg, found damaged ones ({error!r}); "
+                    "restore them, or move this folder away and resume"
+                ) from error
+            found.legs.append(leg)
         return found
 
 

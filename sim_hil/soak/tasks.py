@@ -67,15 +67,28 @@ class Journey:
         """Return a task from pose `at`; None if no landmark can be reached.
 
         If no route can be described unambiguously (such as from a corner), the instruction is a plain "Go to the ...".
+        A robot that stands against furniture may have no path from its own cell: the path then begins at the nearest
+        cell from which the scene can be reached.
         """
+        before = (goal_before(self._grid, thing) for thing in goals(self.scene))
+        if self._grid.space(at[0], at[1]) in {self._grid.space(*goal) for goal in before if goal is not None}:
+            task = self._next(at, at)
+            if task is not None:
+                return task
+        x_m, y_m = self._grid.nearest_in_largest_space(at[0], at[1])
+        return self._next(at, (x_m, y_m, at[2]))
+
+    def _next(self, at: Vec3, begin: Vec3) -> SoakTask | None:
+        """Return a task for a robot at pose `at` whose path begins at pose `begin`; None if there is none."""
+        gap_m = hypot(begin[0] - at[0], begin[1] - at[1])
         things = goals(self.scene)
         order = [things[int(index)] for index in self._rng.permutation(len(things))]
         seed = int(self._rng.integers(2**31))
         for lengths_m in (self._length_m, LENGTH_M):
             for thing in order:
                 try:
-                    task = make_task(self.scene, self._grid, at, thing)
-                    length_m = _length_m(task.path)
+                    task = make_task(self.scene, self._grid, begin, thing)
+                    length_m = gap_m + _length_m(task.path)
                     if lengths_m[0] <= length_m <= lengths_m[1]:
                         return self._task(
                             at, task.goal, thing, length_m, wordings(task.route, 1, seed, held_out=True)[0]
@@ -84,9 +97,10 @@ class Journey:
                     continue
         for thing in order:
             goal = goal_before(self._grid, thing)
-            path = None if goal is None else self._grid.path((at[0], at[1]), goal)
-            if goal is not None and path is not None and _length_m(tuple(path)) >= LENGTH_M[0]:
-                return self._task(at, goal, thing, _length_m(tuple(path)), f"Go to the {thing.landmark}.")
+            path = None if goal is None else self._grid.path((begin[0], begin[1]), goal)
+            length_m = 0.0 if path is None else gap_m + _length_m(tuple(path))
+            if goal is not None and length_m >= LENGTH_M[0]:
+                return self._task(at, goal, thing, length_m, f"Go to the {thing.landmark}.")
         return None
 
     def _task(self, at: Vec3, goal: Vec2, thing: SceneObject, length_m: float, text: str) -> SoakTask:

@@ -22,6 +22,8 @@ from edge.flightlog.recorder import RecordSink
 from edge.inference.generation_task import GenerationModels
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy as Model
+from edge.inference.start_guard import WARM_UP_S
+from edge.inference.warm_up import open_proven
 from edge.motion.controller import Controller, ControllerConfig, VelocityCommand
 from edge.reasoning.generation_cycle import Mode, ReasoningConfig
 from edge.run.assembly import FRAME_MAX_AGE_MS, semantic_config
@@ -61,18 +63,21 @@ class ArtifactsPolicy:
         self, directory: Path, *, mode: str, latency: LatencyProfile, robot: RobotConfig,
         switches: SwitchOptions | None = None,
     ) -> None:  # fmt: skip
-        """Verify and open the graphs. Raises ArtifactError, or ConditionsError for a mode that they do not support.
+        """Verify, open and prove the graphs within limits of time and memory.
 
-        `switches`: decoding rules and recoveries; None: the manifest's, without halting at the goal.
+        Raises ArtifactError, or ConditionsError for a mode that they do not support. A graph that hangs ends the
+        process with EXIT_REFUSED. `switches`: decoding rules and recoveries; None: the manifest's, without halting at
+        the goal.
         """
         self._artifacts = load_artifacts(directory)
         check_suits(self._artifacts, mode)
         self._mode, self._latency, self._robot = Mode(mode), latency, robot
         runtime, asked = self._artifacts.runtime, switches or SwitchOptions()
         self._switches = asked.over(runtime.switches, stand_at_goal=False)
-        self._model = Model(self._artifacts, threads=1)
-        self.language = LanguageModel(self._artifacts, threads=1)
-        note = self.language.speculate() if self._switches.speculation is Speculation.ON else None
+        opened = open_proven(self._artifacts, threads=1)
+        self._model, self.language = opened.policy, opened.language
+        with opened.guard.stage("warming up", WARM_UP_S):
+            note = self.language.speculate() if self._switches.speculation is Speculation.ON else None
         rows = max((rows for rows, _ in latency.call_s), default=0)
         most = 1 if self.language.speculator is None else self.language.rows[-1]
         if self._switches.speculation is Speculation.ON and rows > most:

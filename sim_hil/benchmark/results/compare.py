@@ -13,7 +13,14 @@ from firmware_bridge.system.terminal import CommandParser, one_line
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.results.record import ResultError
 from sim_hil.benchmark.results.report import write_report
-from sim_hil.benchmark.results.store import ResultStore, StoreError, read_config, read_failed, read_results
+from sim_hil.benchmark.results.store import (
+    CONFIG,
+    ResultStore,
+    StoreError,
+    read_config,
+    read_failed,
+    read_results,
+)
 from sim_hil.benchmark.results.summary import compare, summarise
 from sim_hil.benchmark.suite.strata import is_fresh
 
@@ -27,6 +34,7 @@ over tasks and their episodes.
 exit codes: 0 done, 2 bad arguments or input
 """
 _UNITS = {"sr": "SR, points", "spl": "SPL, points", "ne_m": "NE, m", "cr": "CR, points"}
+_CONFIG_KEYS = {"suite": str, "suite_sha256": str, "episodes": list, "conditions": dict, "versions": dict}
 
 
 @command_line("edge-bench")
@@ -62,11 +70,11 @@ def compared(before: Path, after: Path) -> dict[str, Any]:
 
     Raises StoreError or ResultError if the runs cannot be compared.
     """
-    configs = [read_config(directory) for directory in (before, after)]
-    if configs[0].get("suite") != configs[1].get("suite"):
+    configs = [_finished_config(directory) for directory in (before, after)]
+    if configs[0]["suite"] != configs[1]["suite"]:
         raise StoreError(
-            f"{after}: expected a run of the suite {configs[0].get('suite')!r} as in {before}, found "
-            f"{configs[1].get('suite')!r}"
+            f"{after}: expected a run of the suite {configs[0]['suite']!r} as in {before}, found "
+            f"{configs[1]['suite']!r}"
         )
     result = compare(read_results(before), read_results(after))
     if not result["episodes"]:
@@ -76,10 +84,22 @@ def compared(before: Path, after: Path) -> dict[str, Any]:
             "after": {"run": str(after), "conditions": described[1]}, **result}  # fmt: skip
 
 
-def _report(directory: Path) -> int:
+def _finished_config(directory: Path) -> dict[str, Any]:
+    """Read the configuration of a run with all keys that a comparison or a report reads. Raises StoreError."""
     config = read_config(directory)
+    for key, kind in _CONFIG_KEYS.items():
+        if not isinstance(config.get(key), kind):
+            raise StoreError(
+                f"{directory / CONFIG}: expected the configuration of a benchmark run with {key!r} as {kind.__name__}, "
+                f"found {config.get(key)!r:.80}; restore the file, or name the directory of another run"
+            )
+    return config
+
+
+def _report(directory: Path) -> int:
+    config = _finished_config(directory)
     store = ResultStore(directory, config, read_results(directory), failed=read_failed(directory))
-    title = f"DynaNav: {Path(config['suite']).stem}, {config['conditions']['policy']}"
+    title = f"DynaNav: {Path(config['suite']).stem}, {Conditions.of_json(config['conditions']).policy}"
     sys.stdout.write(f"{write_report(store, summarise(store.results), title)}\n")
     return EXIT_DONE
 

@@ -20,6 +20,8 @@ from firmware_bridge.system.input_file import read_json
 DELAY_POINTS = ("mean", "p50", "p99", "max")
 COLUMNS = ("time_s", "x_m", "y_m", "theta_rad", "odom_x_m", "odom_y_m", "vx_mps", "vy_mps", "wz_radps", "delay_s")
 """True pose, odometry position, command, semantic delay (null while there is no semantic state)."""
+_TEXTS = ("id", "task", "scene", "robot", "instruction", "end", "trajectory_sha256", "stopped_by", "clock", "host")
+_WHOLE_NUMBERS = ("people", "seed", "wording", "attempts")
 
 
 class ResultError(ValueError):
@@ -69,11 +71,17 @@ class EpisodeResult:
     host: str
 
     def __post_init__(self) -> None:
+        for kind, what, names in ((str, "text", _TEXTS), (int, "a whole number", _WHOLE_NUMBERS)):
+            for name in names:
+                if type(getattr(self, name)) is not kind:
+                    raise ResultError(f"episode {self.id}: expected {name} as {what}, found {getattr(self, name)!r}")
+        if not all(isinstance(label, str) for label in self.collisions):
+            raise ResultError(f"episode {self.id}: expected collisions as texts, found {self.collisions!r}")
         for name in ("ne_m", "spl", "path_m", "shortest_m", "time_s", "timeout_s", "wall_s"):
             value = getattr(self, name)
             if not (_is_number(value) and value >= 0):
                 raise ResultError(f"episode {self.id}: expected {name} of 0 or more, found {value!r}")
-        if not (isinstance(self.task, str) and self.task):
+        if not self.task:
             raise ResultError(f"episode {self.id}: expected the name of its task, found {self.task!r}")
         if self.spl > 100 or (self.spl > 0 and not self.success):
             raise ResultError(f"episode {self.id}: expected spl of 0..100 and 0 without success, found {self.spl!r}")
@@ -84,8 +92,10 @@ class EpisodeResult:
             raise ResultError(f"episode {self.id}: collided is {self.collided}, collisions are {self.collisions}")
         if len(self.trajectory_sha256) != 64:
             raise ResultError(f"episode {self.id}: expected a SHA-256, found {self.trajectory_sha256!r}")
-        if self.delay_s is not None and set(self.delay_s) != set(DELAY_POINTS):
-            raise ResultError(f"episode {self.id}: expected delay_s with {', '.join(DELAY_POINTS)}")
+        if self.delay_s is not None and not (
+            set(self.delay_s) == set(DELAY_POINTS) and all(map(_is_number, self.delay_s.values()))
+        ):
+            raise ResultError(f"episode {self.id}: expected delay_s with {', '.join(DELAY_POINTS)} in s")
 
     def as_json(self) -> dict[str, Any]:
         """Return the record as JSON values, to be read by `of_json`."""
@@ -100,7 +110,7 @@ class EpisodeResult:
             raise ResultError(f"result: expected an object with the keys {sorted(known)}")
         try:
             return EpisodeResult(**{**content, "collisions": tuple(content["collisions"])})
-        except TypeError as error:
+        except (TypeError, AttributeError) as error:
             raise ResultError(f"result: {error}") from error
 
 

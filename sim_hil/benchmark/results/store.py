@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from edge.core.cli import write_whole
-from firmware_bridge.system.input_file import read_json
+from firmware_bridge.system.input_file import parse_json, read_json
 from sim_hil.benchmark.results.record import EpisodeResult, FailedRun, ResultError
 
 CONFIG, RESULTS, FAILED = "config.json", "results.jsonl", "failed.jsonl"
@@ -112,7 +112,7 @@ class ResultStore:
 
 
 def read_config(directory: Path) -> dict[str, Any]:
-    """Read the configuration of a run. Raises StoreError."""
+    """Read the configuration of a run, of any keys. Raises StoreError."""
     path = directory / CONFIG
     try:
         content = read_json(path)
@@ -131,7 +131,7 @@ def read_results(directory: Path) -> list[EpisodeResult]:
     results: dict[str, EpisodeResult] = {}
     for number, line in enumerate(_whole_lines(path), 1):
         try:
-            result = EpisodeResult.of_json(json.loads(line))
+            result = EpisodeResult.of_json(parse_json(line))
         except (ValueError, ResultError) as error:
             raise StoreError(f"{path}:{number}: {error}") from error
         if result.id in results:
@@ -146,7 +146,7 @@ def read_failed(directory: Path) -> list[FailedRun]:
     failed = []
     for number, line in enumerate(_whole_lines(path) if path.exists() else (), 1):
         try:
-            failed.append(FailedRun.of_json(json.loads(line)))
+            failed.append(FailedRun.of_json(parse_json(line)))
         except (ValueError, ResultError) as error:
             raise StoreError(f"{path}:{number}: {error}") from error
     return failed

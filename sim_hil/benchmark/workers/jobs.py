@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from edge.core.cli import write_whole
+from edge.core.cli import EXIT_REFUSED, write_whole
 from sim_hil.benchmark.conditions.conditions import ConditionsError
 from sim_hil.benchmark.results.record import EpisodeResult, FailedRun, ResultError
 from sim_hil.benchmark.results.store import EPISODES, ResultStore
@@ -178,8 +178,10 @@ class LocalJobs:
                 continue
             del self._times_s[event.key]
             why = f"its process gave no result: {event.failure or 'ended with exit code 0'}"
+            # The guard of unproven graphs ends a process that hangs in one: a further attempt would hang too.
+            refused = EXIT_REFUSED if event.code == EXIT_REFUSED else None
             known = event.key in self._results
-            ended.append(self._results.pop(event.key) if known else Ended(event.key, why=why))
+            ended.append(self._results.pop(event.key) if known else Ended(event.key, why=why, refused_code=refused))
         return ended
 
     def times_s(self) -> dict[str, float]:

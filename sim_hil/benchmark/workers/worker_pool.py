@@ -35,6 +35,8 @@ class WorkerEvent:
     key: str
     message: Message | None
     failure: str = ""
+    code: int = 0
+    """Exit code of a worker that has ended, negative for a signal."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +152,7 @@ class Workers:
         if code == 0:
             worker.log.unlink(missing_ok=True)
             return WorkerEvent(worker.key, None)
-        return WorkerEvent(worker.key, None, f"{exit_text(code)}{_last_line(worker.log)}")
+        return WorkerEvent(worker.key, None, f"{exit_text(code)}{_last_line(worker.log)}", code)
 
 
 def _last_line(log: Path) -> str:

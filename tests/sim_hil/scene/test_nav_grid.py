@@ -11,7 +11,7 @@ import pytest
 
 from sim_hil.benchmark.suite.robots import robot_grid
 from sim_hil.scene.nav_grid import NavGrid, length_m
-from sim_hil.scene.scene import Terrain, Wall
+from sim_hil.scene.scene import SceneError, Terrain, Wall
 from tests.support.benchmark.benchmark_episodes import block, hall
 
 CLEARANCE_M = 0.4
@@ -143,7 +143,7 @@ def test_a_platform_is_reached_by_its_ramp() -> None:
 
 
 def test_a_scene_without_room_is_refused() -> None:
-    with pytest.raises(ValueError, match="no room"):
+    with pytest.raises(SceneError, match="expected room for a clearance of"):
         NavGrid(hall(block(0.0, 0.0, 20.0, 10.0)), clearance_m=CLEARANCE_M)
 
 

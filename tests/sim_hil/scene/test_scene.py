@@ -231,6 +231,7 @@ def test_unknown_scene_is_refused_by_naming_the_known_ones() -> None:
         ("size_m = [0.8, 1.1, 1.9]", "size_m = [0.8, 1.1, -1]", "positive"),
         ("goal_xy = [24.0, 0.6]", "goal_xy = [240.0, 0.6]", "goal_xy"),
         ("goal_xy = [24.0, 0.6]", "goal_xy = [nan, 0.6]", "goal_xy"),
+        ("max_m = [28.0, 2.0]", "max_m = [1e6, 1e6]", "floor: expected at most 250000 m²"),
         ('texture = "floor_tiles"', 'texture = "lava"', "lava"),
         ('label = "right wall"', 'label = "left wall"', "unique"),
         ("start = [0.0, 0.0, 0.0]", "", "start"),

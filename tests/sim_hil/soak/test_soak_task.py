@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim_hil.benchmark.suite.robots import footprint_m
+from sim_hil.benchmark.suite.robots import footprint_m, robot_grid
 from sim_hil.realtime.truth import TruePose, TruthTail
 from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.scene.scene import Scene, load_scene
@@ -54,6 +54,20 @@ def test_a_task_exists_from_every_free_place(office: Scene) -> None:
         if grid.is_free(at[0], at[1]):
             found += 1
             assert journey.next(at) is not None, at
+
+
+def test_a_robot_in_a_pocket_between_furniture_gets_a_task() -> None:
+    """The nearest free cell of the pose lies in a pocket that no path leaves; seen in a soak, where the leg ended."""
+    scene = load_scene("hospital")
+    at = (3.145, 12.885, -0.41)
+    grid = robot_grid(scene, "go2")
+    task = Journey(scene, seed=1, leg=1, speed_mps=0.8).next(at)
+    assert task is not None and task.start == at
+    assert grid.path(at[:2], task.goal_xy) is None
+    begin = grid.nearest_in_largest_space(at[0], at[1])
+    straight_m = hypot(begin[0] - at[0], begin[1] - at[1])
+    assert 0 < straight_m < 1.5
+    assert task.shortest_m == pytest.approx(straight_m + grid.distance_m(begin, task.goal_xy), rel=1e-6)
 
 
 def task(goal: tuple[float, float] = (10.0, 0.0), timeout_s: float = 30.0) -> SoakTask:

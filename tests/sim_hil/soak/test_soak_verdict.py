@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -94,9 +95,7 @@ def test_a_soak_without_faults_is_not_judged_by_the_answers_to_them() -> None:
 def test_a_soak_without_measurements_is_undecided_with_exit_code_1(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    options = SoakOptions(
-        tmp_path, "0" * 64, True, ("hospital",), 0, 0, 60.0, 60.0, 0.8, None, "async", "0", "none", 0, "go2", "default"
-    )
+    options = soak_options(tmp_path)
     soak = SoakFolder.create(tmp_path / "out", options)
     result = soak_result(soak, options, load_budget(DEFAULT_BUDGET), None, finished=True)
     assert {line["verdict"] for line in result["budget"]} == {UNDECIDED} == {result["verdict"]}
@@ -105,6 +104,52 @@ def test_a_soak_without_measurements_is_undecided_with_exit_code_1(
     page = write_report(soak, result).read_text(encoding="utf-8")
     assert '<span class="verdict bad">UNDECIDED</span>' in page
     assert "no verdict: 13 of 13 budget lines are undecided" in page
+
+
+def soak_options(folder: Path) -> SoakOptions:
+    return SoakOptions(
+        folder, "0" * 64, True, ("hospital",), 0, 0, 60.0, 60.0, 0.8, None, "async", "0", "none", 0, "go2", "default"
+    )
+
+
+@pytest.mark.parametrize("legs_run", [False, True])
+def test_a_soak_whose_folder_is_deleted_ends_in_one_line_with_exit_code_1(
+    legs_run: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run_legs(soak: SoakFolder, *_: object, **__: object) -> bool:
+        shutil.rmtree(soak.path)
+        if legs_run:  # the loss is noticed when the samples of the first leg are read
+            soak.legs.append({"leg": {"number": 1}, "elapsed_s": 60.0})
+            return True
+        raise FileNotFoundError(2, "No such file or directory", str(soak.folder(1)))
+
+    monkeypatch.setattr(cli, "options_of", lambda _: soak_options(tmp_path))
+    monkeypatch.setattr(cli, "run_legs", run_legs)
+    out = tmp_path / "out"
+    code = cli.main(["--artifacts", str(tmp_path), "--duration", "1m", "--out", str(out)])
+    error = capsys.readouterr().err.strip()
+    assert code == 1 and "\n" not in error and f"--out {out}: expected the soak's files to stay" in error
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("config.json", "[]", r"config\.json: expected an object, found list"),
+        ("legs/001/analysis.json", "{}", r"legs/001: expected the files of a leg, found damaged ones \(KeyError"),
+        ("legs/001/analysis.json", "[" * 100_000, "legs/001: .*nested too deeply"),
+        ("legs/001/leg.json", "[]", "legs/001: expected the files of a leg"),
+    ],
+)
+def test_a_damaged_soak_is_not_resumed(tmp_path: Path, name: str, text: str, message: str) -> None:
+    options = soak_options(tmp_path)
+    soak = SoakFolder.create(tmp_path / "out", options)
+    soak.folder(1).mkdir()
+    for file in ("samples.jsonl", "events.jsonl"):
+        (soak.folder(1) / file).touch()
+    (soak.path / name).write_text(text, encoding="utf-8")
+    with pytest.raises(SoakInputError, match=message):
+        SoakFolder.resume(soak.path, options)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +27,7 @@ from sim_hil.benchmark.env.observation import Observation
 from sim_hil.benchmark.policies.artifacts_policy import ArtifactsPolicy, check_suits
 from sim_hil.benchmark.policies.select import camera_for, check_artifacts, open_policy, robot_config
 from tests.edge.flightlog.test_log_schemas import complaints
+from tests.support.artifact_directory import edit_manifest
 from tests.support.benchmark import dynanav_fakes as fakes
 
 LIMITS = robot_config().limits
@@ -70,6 +72,13 @@ def drive(policy: ArtifactsPolicy, ticks: int, *, step_m: float = 0.05, seed: in
         rows.append((command, policy.notes()))
         x_m += step_m if not obeys or any(command) else 0.0
     return rows
+
+
+def test_graphs_that_the_self_test_cannot_prove_are_refused(artifacts_dir: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))
+    edit_manifest(copy, lambda manifest: manifest.update(self_test={}))
+    with pytest.raises(ArtifactError, match="no known answers for the self-test; export again"):
+        ArtifactsPolicy(copy, mode="async", latency=LatencyProfile.constant(0.5), robot=robot_config())
 
 
 def test_it_stands_until_the_first_latency_is_over_and_drives_from_then_on(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from sim_hil.benchmark.results.record import FailedRun, ResultError
+from sim_hil.benchmark.results import compare
+from sim_hil.benchmark.results.record import DELAY_POINTS, FailedRun, ResultError
 from sim_hil.benchmark.results.store import FAILED, RESULTS, ResultStore, StoreError, read_failed, read_results
 from tests.support.benchmark import dynanav_fakes as fakes
 
@@ -89,6 +91,10 @@ def test_failed_runs_are_read_back_without_a_torn_last_line(tmp_path: Path) -> N
     assert read_failed(store.directory) == [FailedRun("a", 2, "died")] == store.failed
 
 
+def _line(**wrong: object) -> str:
+    return json.dumps({**fakes.result("a").as_json(), **wrong})
+
+
 @pytest.mark.parametrize(
     ("name", "read", "line", "problem"),
     [
@@ -99,6 +105,15 @@ def test_failed_runs_are_read_back_without_a_torn_last_line(tmp_path: Path) -> N
             "failed run: expected an object with id",
         ),
         (RESULTS, read_results, '{"id": 3}', "result: expected an object with the keys"),
+        (RESULTS, read_results, "[" * 100_000, "nested too deeply"),
+        (FAILED, read_failed, "[" * 100_000, "nested too deeply"),
+        (RESULTS, read_results, _line(id=[]), r"episode \[\]: expected id as text, found \[\]"),
+        (RESULTS, read_results, _line(scene={}), r"episode a: expected scene as text, found \{\}"),
+        (RESULTS, read_results, _line(ne_m=10**400), "an integer of 1329 bits"),
+        (RESULTS, read_results, _line(seed="1"), "episode a: expected seed as a whole number, found '1'"),
+        (RESULTS, read_results, _line(collisions=[{}], collided=True), "episode a: expected collisions as texts"),
+        (RESULTS, read_results, _line(delay_s=5), "result: 'int' object"),
+        (RESULTS, read_results, _line(delay_s=dict.fromkeys(DELAY_POINTS, "x")), "episode a: expected delay_s with"),
     ],
 )
 def test_a_damaged_line_is_refused_with_its_number(
@@ -118,3 +133,26 @@ def test_a_damaged_line_is_refused_with_its_number(
 def test_a_result_that_contradicts_itself_is_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(ResultError):
         fakes.result("a", **wrong)
+
+
+@pytest.mark.parametrize("job", [["compare", "out", "out"], ["report", "out"]], ids=lambda job: job[0])
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [({}, "'suite' as str, found None"), ({**CONFIG, "suite_sha256": "", "conditions": []}, "'conditions' as dict")],
+    ids=["empty", "conditions that are a list"],
+)
+def test_a_run_with_a_damaged_configuration_is_refused_in_one_line(
+    content: dict[str, object],
+    found: str,
+    job: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    store = made(tmp_path)
+    store.add(fakes.result("a"))
+    (store.directory / "config.json").write_text(json.dumps(content), encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    assert compare.main(job) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "config.json: expected the configuration" in error and found in error

@@ -8,11 +8,14 @@ from pathlib import Path
 
 import pytest
 
+from sim_hil.benchmark.conditions.rewording import training_texts
 from sim_hil.benchmark.language.task_checks import MIN_PIXELS
 from sim_hil.benchmark.language.visibility import EYE_M, Sightlines
 from sim_hil.benchmark.suite.episode import Episode, load_suite, suite_to_toml
 from sim_hil.benchmark.suite.validate import Validator, main, validate
-from sim_hil.scene.scene import SceneObject, load_scene
+from sim_hil.scene.scene import SceneError, SceneObject, load_scene, scene_to_toml
+from tests.support.benchmark import dynanav_fakes
+from tests.support.benchmark.benchmark_episodes import block, hall
 
 EPISODES = load_suite("dynanav")
 SOUND = next(episode for episode in EPISODES if episode.task == "warehouse-cone")
@@ -122,3 +125,15 @@ def test_landmarks_behind_the_robot_a_wall_or_beyond_range_are_not_seen() -> Non
     beyond = replace(PLATE, position_m=(8.0, 3.5, 0.0), heading_rad=-1.5707963)
     assert lines.pixels((8.0, 0.0, EYE_M), 1.5707963, beyond, 12.0) == 0
     assert lines.pixels((8.0, 0.0, EYE_M), 1.5707963, replace(beyond, position_m=(8.0, 1.5, 0.0)), 12.0) > MIN_PIXELS
+
+
+def test_a_scene_without_room_is_one_line_for_every_reader(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene, suite = tmp_path / "full.toml", tmp_path / "suite.toml"
+    scene.write_text(scene_to_toml(hall(block(0.0, 0.0, 20.0, 10.0))), encoding="utf-8")
+    text = dynanav_fakes.suite_text("a").replace('scene = "corridor"', f'scene = "{scene}"')
+    suite.write_text(text.replace("[1.0, 0.0, 0.0]", "[-8.0, 0.0, 0.0]"), encoding="utf-8")
+    assert main(["--suite", str(suite)]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "expected room for a clearance of" in error
+    with pytest.raises(SceneError, match="expected room"):
+        training_texts(load_suite(str(suite)))

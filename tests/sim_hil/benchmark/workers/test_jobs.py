@@ -126,6 +126,13 @@ def test_half_a_result_is_none(tmp_path: Path) -> None:
     assert not store.results and store.failed[0].why == "its process gave no result: ended with exit code 0"
 
 
+def test_a_process_that_the_guard_of_unproven_graphs_ends_is_a_refusal(tmp_path: Path) -> None:
+    store = store_in(tmp_path)
+    with pytest.raises(RefusedRunError, match=r"exit code 3: .*self-test: not done after its limit of 9 s") as caught:
+        run_all(tasks_in(store, "guarded"), LocalJobs(1, FAKE_WORKER), store)
+    assert caught.value.code == 3 and not store.failed
+
+
 def test_a_permanent_failure_ends_the_run_with_its_line(tmp_path: Path) -> None:
     store = store_in(tmp_path)
     with pytest.raises(RefusedRunError, match="episode refuses: no such scene") as caught:
