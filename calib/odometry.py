@@ -8,7 +8,6 @@ unknown robot as prior, so that what the drive does not show (sideways motion, s
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 from bisect import bisect_right
@@ -39,6 +38,7 @@ from edge.odometry.gate import Increment, OdometryGate, OdometryInputs
 from edge.odometry.pose_chain import Interval, OdometryModel, integrate, split
 from edge.odometry.visual_odometry import VisualOdometry, grey_frame
 from firmware_bridge.core.config import ConfigError, load_robot_config
+from firmware_bridge.system.input_file import parse_json, read_bytes
 
 Array = npt.NDArray[np.float64]
 EPILOG = """examples:
@@ -47,6 +47,8 @@ EPILOG = """examples:
 Drive at least 10 m for this, with curves to both sides, and stand for 3 s before.
 """
 TRUTH_INTERVAL_NS = 500_000_000
+MAX_TRUTH_BYTES = 1 << 30
+"""Largest trace of a truth, bytes: some seven hours of edge-hil."""
 MIN_DISTANCE_M = 5.0
 MIN_INTERVALS = 15
 MAX_UNEXPLAINED = 0.15
@@ -112,7 +114,7 @@ def read_drive(path: Path) -> Drive:
                 reports.append(_report(stamp_ns, payload))
             elif topic == "/camera":
                 pictures.append((stamp_ns, jpeg_bytes(payload)))
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise LogError(
                 f"{path}: {topic} at {stamp_ns} ns cannot be read ({error}): is the log of an older release?"
             ) from error
@@ -196,13 +198,13 @@ def truth_references(path: Path, begin_ns: int, end_ns: int) -> list[Reference]:
     """Read the motion of a ground-truth trace (`edge-hil --trace`), every 0.5 s. Raises LogError or OSError."""
     stamps: list[int] = []
     poses: list[SE2] = []
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+    for number, line in enumerate(read_bytes(path, MAX_TRUTH_BYTES).splitlines(), 1):
         try:
-            entry = json.loads(line)
+            entry = parse_json(line)
             if entry["kind"] == "pose":
                 stamps.append(int(entry["t_ns"]))
                 poses.append(SE2(float(entry["x"]), float(entry["y"]), float(entry["theta"])))
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise LogError(f"{path}:{number}: expected a line of edge-hil's trace ({error})") from error
     references: list[Reference] = []
     start_ns = max(begin_ns, stamps[0]) if stamps else end_ns

@@ -157,7 +157,10 @@ def load_artifacts(directory: Path, trust: Trust | None = None) -> Artifacts:
     contents = {name: read_file(directory, name, entry) for name, entry in files.items() if name not in data}
     identities = {name: hash_file(directory, name, entry) for name, entry in files.items() if name in data}
     known = {*files, MANIFEST_NAME, SIGNATURE_NAME}
-    unlisted = sorted(path.name for path in directory.iterdir() if path.name not in known)
+    try:
+        unlisted = sorted(path.name for path in directory.iterdir() if path.name not in known)
+    except OSError as error:  # a directory without the right to read may still be entered
+        raise ArtifactError(f"{directory}: cannot be listed ({error.strerror}); give this user read access") from error
     if unlisted:
         raise ArtifactError(f"{directory / unlisted[0]}: not listed in the manifest; export again into a new directory")
     pair = all(name in _section(manifest, "graphs") for name in LANGUAGE_PAIR)

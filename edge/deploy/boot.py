@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import subprocess
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -65,7 +66,11 @@ def _set(args: argparse.Namespace, say: Callable[[str], None], root: Path, comma
         words = ["nvpmodel", "-m", str(mode)]
         say(f"{' '.join(words)}: power mode {args.power_mode}, stored for every start")
         if not args.dry_run:
-            code, output = command(words)
+            try:
+                code, output = command(words)
+            except subprocess.TimeoutExpired as error:
+                say(f"{' '.join(words)}: expected an answer within {error.timeout:g} s, found none; restart the Jetson")
+                return EXIT_CHECK_FAILED
             if code != 0:
                 say(f"{' '.join(words)}: failed: {output.strip() or f'exit code {code}'}")
                 return EXIT_CHECK_FAILED

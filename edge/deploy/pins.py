@@ -6,8 +6,10 @@ file with another hash, wherever it comes from.
 
 from __future__ import annotations
 
+import lzma
 import sys
 import zipfile
+import zlib
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from email.parser import Parser
@@ -23,6 +25,8 @@ PLATFORMS: Final = "# platforms: "
 EXTRAS: Final = "# extras: "
 BASE: Final = "base"
 _MAX_BYTES: Final = 1_000_000
+_DAMAGED: Final = (zipfile.BadZipFile, EOFError, zlib.error, lzma.LZMAError, UnicodeDecodeError, RuntimeError)
+"""Errors of a zip file that is cut, damaged, encrypted or compressed by a method that wheels do not have."""
 
 
 class PinsError(ValueError):
@@ -53,7 +57,7 @@ def read_pins(wheel: Path) -> Pins | None:
             if archive.getinfo(FILE).file_size > _MAX_BYTES:
                 raise PinsError(f"{wheel}: {FILE} is larger than {_MAX_BYTES} bytes")
             return parse_pins(archive.read(FILE).decode("utf-8"))
-    except (zipfile.BadZipFile, EOFError, UnicodeDecodeError) as error:
+    except _DAMAGED as error:
         raise PinsError(f"{wheel}: not a whole wheel ({error}); copy it again") from error
 
 
@@ -117,7 +121,7 @@ def wheel_extras(wheel: Path) -> frozenset[str]:
             if broken is not None or not names:
                 raise PinsError(f"{wheel}: not a whole wheel ({broken or 'no METADATA'}); copy it again")
             metadata = Parser().parsestr(archive.read(names[0]).decode())
-    except (zipfile.BadZipFile, EOFError) as error:
+    except _DAMAGED as error:
         raise PinsError(f"{wheel}: not a whole wheel ({error}); copy it again") from error
     if metadata["Name"] != "tic-vla-edge":
         raise PinsError(f"{wheel}: expected a wheel of tic-vla-edge, found {metadata['Name']}")

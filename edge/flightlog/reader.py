@@ -4,25 +4,31 @@ from __future__ import annotations
 
 import base64
 import binascii
-import json
+import io
 import re
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
+import lz4.frame
 import zstandard
 from mcap.exceptions import McapError
-from mcap.records import Channel, Message
-from mcap.stream_reader import CRCValidationError, StreamReader
+from mcap.records import Channel, Chunk, McapRecord, Message
+from mcap.stream_reader import StreamReader, breakup_chunk
 
-from firmware_bridge.system.input_file import open_regular
+from firmware_bridge.system.input_file import open_regular, parse_json
 
 _MAGIC = b"\x89MCAP0\r\n"
 _RECORD_LIMIT_BYTES = 256 * 1024 * 1024
+_CHUNK_LIMIT_BYTES = 64 * 1024 * 1024
+"""Largest chunk after decompression, bytes; the recorder ends its own at 256 KiB. Kilobytes of zstd can expand to
+gigabytes."""
 
-# Errors of the MCAP reader at a cut: too few bytes for a number, a string, a compressed block, or a bad checksum.
-_CUT = (McapError, CRCValidationError, struct.error, zstandard.ZstdError, UnicodeDecodeError, MemoryError)
+# Errors of the MCAP reader at a cut or at damage: too few bytes for a number, a string or a compressed block (a
+# RuntimeError of lz4), a bad checksum (a ValueError), a message that is no JSON, an unknown channel.
+_CUT = (McapError, struct.error, zstandard.ZstdError, ValueError, RuntimeError, KeyError, MemoryError)
 
 
 class RecordingError(ValueError):
@@ -73,9 +79,7 @@ def _is_mcap(path: Path) -> bool:
 def _read_part(path: Path) -> Iterator[tuple[str, int, dict[str, Any]]]:
     with open_regular(path) as stream:
         stream.seek(len(_MAGIC))
-        records = StreamReader(
-            stream, skip_magic=True, validate_crcs=True, record_size_limit=_RECORD_LIMIT_BYTES
-        ).records
+        records = _records(stream)
         topics: dict[int, str] = {}
         while True:
             try:
@@ -86,10 +90,41 @@ def _read_part(path: Path) -> Iterator[tuple[str, int, dict[str, Any]]]:
                     topics[record.id] = record.topic
                 if not isinstance(record, Message):
                     continue
-                topic, payload = topics[record.channel_id], json.loads(record.data)
-            except (*_CUT, KeyError, json.JSONDecodeError):
+                topic, payload = topics[record.channel_id], parse_json(record.data)
+            except _CUT:
+                return
+            if not isinstance(payload, dict):
                 return
             yield topic, record.log_time, payload
+
+
+def _records(stream: BinaryIO) -> Iterator[McapRecord]:
+    """Yield the records of a part, also those of its chunks. Raises the errors of _CUT."""
+    reader = StreamReader(
+        stream, skip_magic=True, emit_chunks=True, validate_crcs=True, record_size_limit=_RECORD_LIMIT_BYTES
+    )
+    for record in reader.records:
+        if isinstance(record, Chunk):
+            yield from breakup_chunk(_decompressed(record), validate_crc=True)
+        else:
+            yield record
+
+
+def _decompressed(chunk: Chunk) -> Chunk:
+    """Return a chunk without compression. Raises ValueError where its size is not the stated one or too large."""
+    size = chunk.uncompressed_size
+    if size > _CHUNK_LIMIT_BYTES:
+        raise ValueError(f"a chunk of {size} bytes, expected at most {_CHUNK_LIMIT_BYTES}")
+    # One byte more than stated shows that the data is longer, whatever the frame itself states.
+    if chunk.compression == "zstd":
+        data = zstandard.ZstdDecompressor().stream_reader(io.BytesIO(chunk.data)).read(size + 1)
+    elif chunk.compression == "lz4":
+        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, size + 1)
+    else:
+        return chunk
+    if len(data) != size:
+        raise ValueError(f"a chunk of {len(data)} bytes or more, expected {size}")
+    return replace(chunk, compression="", data=data)
 
 
 def jpeg_bytes(payload: dict[str, Any]) -> bytes:

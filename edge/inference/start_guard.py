@@ -69,11 +69,11 @@ def memory_limit(artifacts: Artifacts, available: int) -> int:
     return min(limit, round(SHARE * available)) if available else limit
 
 
-def end_process(line: str) -> None:
+def end_process(line: str, code: int = EXIT_REFUSED) -> None:
     """Print one line and end the process at once: a thread hangs in native code that nothing else ends."""
     name = Path(sys.argv[0]).stem if sys.argv and sys.argv[0] else "edge"
     os.write(2, f"{name}: {line}\n".encode(errors="replace"))
-    os._exit(EXIT_REFUSED)
+    os._exit(code)
 
 
 class StartGuard:

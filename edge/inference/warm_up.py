@@ -54,12 +54,16 @@ def open_proven(
     schedule: Schedule | None = None,
     activity: TickActivity | None = None,
     guard: StartGuard | None = None,
+    threads: int | None = None,
 ) -> Opened:
-    """Open every graph on the provider that ships and run the self-test; raises ArtifactError."""
+    """Open every graph on the provider that ships and run the self-test; raises ArtifactError.
+
+    `threads`: threads of each graph; None: the manifest's.
+    """
     guard = guard or StartGuard(artifacts)
     with guard.stage("opening the graphs", OPEN_S):
-        policy = Policy(artifacts, schedule=schedule, activity=activity, interrupt=guard.interrupt)
-        language = LanguageModel(artifacts, schedule=schedule, interrupt=guard.interrupt)
+        policy = Policy(artifacts, threads=threads, schedule=schedule, activity=activity, interrupt=guard.interrupt)
+        language = LanguageModel(artifacts, threads=threads, schedule=schedule, interrupt=guard.interrupt)
     known = artifacts.known_answers
     with guard.stage("self-test", OPEN_S if known is None else known.limit_s):
         return Opened(policy, language, check_answers(policy, language, known), guard)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import zipfile
 from collections.abc import Callable, Mapping
@@ -112,7 +113,8 @@ def inside(directory: Path, name: str) -> Path:
     path = directory / name
     if Path(name).name != name or name in ("", ".", "..") or not name.isprintable():
         raise CheckpointError(f"{directory}: {name!r} is not a file name of this directory")
-    root, target = directory.resolve(), path.resolve()
+    # Path.resolve raises RuntimeError for a loop of links before Python 3.13.
+    root, target = Path(os.path.realpath(directory)), Path(os.path.realpath(path))
     blobs = root.parent.parent / "blobs"
     cached = root.parent.name == "snapshots" and target.parent == blobs
     if target.parent != root and not cached:
@@ -229,10 +231,11 @@ class _FormatError(ValueError):
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) != len(pairs):
-        names = [name for name, _ in pairs]
-        raise _FormatError(f"{next(n for n in names if names.count(n) > 1)} occurs twice")
+    found: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in found:
+            raise _FormatError(f"{name} occurs twice")
+        found[name] = value
     return found
 
 

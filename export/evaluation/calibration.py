@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ import numpy.typing as npt
 from edge.core.geometry import SE2
 from edge.reasoning.prompt import InstructionError, check_instruction
 from export.core.typed import FieldError, build
-from firmware_bridge.system.input_file import open_regular, parse_toml
+from firmware_bridge.system.input_file import open_regular, parse_toml, read_bytes
 
 Picture = npt.NDArray[np.uint8]
 
@@ -130,7 +131,7 @@ def load_calibration(name: str) -> CalibrationSet:
     """Load a set by name, `folder:PATH` or `video:PATH`. Raises CalibrationError with a one-line message."""
     kind, colon, path = name.partition(":")
     if colon and kind in USER_KINDS and path:
-        return USER_KINDS[kind](f"{kind}:{Path(path).resolve().name}", Path(path))
+        return USER_KINDS[kind](f"{kind}:{Path(os.path.realpath(path)).name}", Path(path))
     if name not in list_calibration_sets():
         known = ", ".join(list_calibration_sets())
         raise CalibrationError(
@@ -220,7 +221,7 @@ def _load_folder(name: str, folder: Path) -> CalibrationSet:
         digest, images = hashlib.sha256(), {}
         used = [i for window in _windows(len(paths), where) for i in window]
         for index, path in enumerate(paths):
-            data = path.read_bytes()
+            data = read_bytes(path)  # a sparse file of terabytes costs its writer nothing
             digest.update(f"{path.name}\0{len(data)}\0".encode())
             digest.update(data)
             if index in used:

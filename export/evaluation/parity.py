@@ -15,6 +15,7 @@ import numpy.typing as npt
 import torch
 from safetensors.numpy import load_file, save_file
 
+from export.core.tensor_file import replacing
 from export.evaluation.task_error import StageOutputs, short
 from export.evaluation.task_error import cosine as cosine_of
 from export.graphs.action import context_shapes, guidance_input
@@ -216,14 +217,15 @@ def _language_outputs(model: TicVla, name: str, feeds: Arrays) -> Arrays:
 
 
 def save_samples(samples: Sequence[Sample], path: Path) -> None:
-    """Write test inputs and expected outputs to a safetensors file."""
+    """Write test inputs and expected outputs to a safetensors file. Raises OSError."""
     tensors = {
         f"{index}/{kind}/{name}": np.ascontiguousarray(array)
         for index, sample in enumerate(samples)
         for kind, arrays in (("feed", sample.feeds), ("expected", sample.expected))
         for name, array in arrays.items()
     }
-    save_file(tensors, path)
+    with replacing(path) as partial:
+        save_file(tensors, partial)
 
 
 def load_samples(path: Path) -> list[Sample]:
@@ -237,14 +239,15 @@ def load_samples(path: Path) -> list[Sample]:
 
 
 def save_outputs(outputs: StageOutputs, path: Path) -> None:
-    """Write the reference outputs for the task error to one safetensors file."""
+    """Write the reference outputs for the task error to one safetensors file. Raises OSError."""
     tensors = {
         f"{kind}/{index}": np.ascontiguousarray(array)
         for kind in ("visual", "kv", "trajectories", "swapped")
         for index, array in enumerate(getattr(outputs, kind))
     }
     tensors |= {f"token_ids/{index}": np.array(ids, dtype=np.int64) for index, ids in enumerate(outputs.token_ids)}
-    save_file(tensors, path)
+    with replacing(path) as partial:
+        save_file(tensors, partial)
 
 
 def load_outputs(path: Path) -> StageOutputs:

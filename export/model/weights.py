@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import save_file
 
+from export.core.tensor_file import replacing
 from export.model.network import PARTS, TicVla
 
 FORMAT = "tic-vla-edge/1"
@@ -49,8 +50,6 @@ def save_weights(model: TicVla, path: Path, info: WeightsInfo, parts: Sequence[s
         "trained": "true" if info.trained else "false",
         "origin": info.origin,
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
     tensors = {k: v.contiguous() for k, v in model.state_dict().items() if k.split(".")[0] in parts}
-    save_file(tensors, str(partial), metadata=metadata)
-    partial.replace(path)
+    with replacing(path) as partial:
+        save_file(tensors, str(partial), metadata=metadata)

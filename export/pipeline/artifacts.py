@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import os
@@ -33,7 +34,7 @@ from export.pipeline.self_test import (
 )
 from export.plan.plan import Plan, plan
 from export.targets.file import Target
-from firmware_bridge.system.input_file import read_json
+from firmware_bridge.system.input_file import open_regular, read_json
 from reporting.progress import BuildProgress
 
 REPORT_JSON, REPORT_HTML, TOKENIZER_NAME = "report.json", "report.html", "tokenizer.json"
@@ -133,21 +134,32 @@ def check_replaceable(out: Path) -> None:
 
 
 def _files_of(out: Path) -> dict[str, Any]:
-    """Return the files that a manifest lists; those of an older schema only if all match it."""
+    """Return the files that a manifest lists; those of an older schema only if all match it. Raises ArtifactError."""
     try:
-        return dict(read_manifest(out)["files"])
+        listed = read_manifest(out)["files"]
+        if not isinstance(listed, dict):
+            raise ArtifactError(f"{out / MANIFEST_NAME}: files must be an object; name another directory")
+        return dict(listed)
     except ArtifactError:
         try:
             older = read_json(out / MANIFEST_NAME)
             files = dict(older["files"])
-            ours = older["schema_version"] in OLDER_SCHEMAS and all(
-                file_sha256(out / name) == entry["sha256"] for name, entry in files.items()
-            )
-        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            # All names before any file: hashing a listed device would never end.
+            ours = older["schema_version"] in OLDER_SCHEMAS and all(Path(name).name == name for name in files)
+            ours = ours and all(_regular_sha256(out / name) == entry["sha256"] for name, entry in files.items())
+        except (OSError, ValueError, KeyError, TypeError):
             ours = False
         if not ours:
             raise
         return files
+
+
+def _regular_sha256(path: Path) -> str:
+    """Hash a regular file of this directory; raises OSError for a link, a device or a FIFO."""
+    if path.is_symlink():
+        raise OSError(errno.ELOOP, "is a link", str(path))
+    open_regular(path).close()
+    return file_sha256(path)
 
 
 def _swap(made: Path, out: Path, retired: Path) -> None:
@@ -307,7 +319,7 @@ def _check_manifest(pipeline: Pipeline, directory: Path, manifest: Mapping[str, 
         "plan": made.to_dict(),
     }
     found = {key: manifest[key] for key in ("target", "model", "runtime", "plan")}
-    found["provenance.target"] = {key: manifest["provenance"]["target"][key] for key in TARGET_SECTIONS}
+    found["provenance.target"] = {key: manifest["provenance"]["target"].get(key) for key in TARGET_SECTIONS}
     for name in job.target.graph_names:
         expected[f"graphs.{name}"] = {
             "precision": pipeline.precision(name)[0].to_dict(),
@@ -315,6 +327,8 @@ def _check_manifest(pipeline: Pipeline, directory: Path, manifest: Mapping[str, 
             "session": job.target.session(name, graphs[name]["inputs"]),
         }
         found[f"graphs.{name}"] = {key: graphs[name].get(key) for key in ("precision", "form", "session")}
+        # What the result shows of a graph; its reason is the text of the release that exported.
+        _check_shown(directory, name, graphs[name])
     if manifest["self_test"]:  # the self-test itself refuses a manifest without answers
         made_of = {"plan": expected["plan"], "graphs": {name: expected[f"graphs.{name}"] for name in graphs}}
         found["self_test"], expected["self_test"] = recorded_and_expected_limits(
@@ -326,6 +340,16 @@ def _check_manifest(pipeline: Pipeline, directory: Path, manifest: Mapping[str, 
             raise ArtifactError(f"{directory / MANIFEST_NAME}: {difference}; export again")
     if (directory / TOKENIZER_NAME).read_bytes() != pipeline.tokenizer():
         raise ArtifactError(f"{directory / TOKENIZER_NAME}: not the tokenizer of these weights; export again")
+
+
+def _check_shown(directory: Path, name: str, graph: Mapping[str, Any]) -> None:
+    """Check the values of a graph that only people read. Raises ArtifactError."""
+    for key, kind in (("params", int), ("bytes", int), ("precision_reason", str)):
+        if type(graph.get(key)) is not kind:
+            raise ArtifactError(
+                f"{directory / MANIFEST_NAME}: graphs.{name}.{key} is {_shown(graph.get(key))}, "
+                f"this export writes {'a text' if kind is str else 'a whole number'}; export again"
+            )
 
 
 def _difference(found: object, expected: object, key: str) -> str | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from dataclasses import asdict
 from pathlib import Path
 
@@ -150,6 +151,31 @@ def test_a_trace_of_another_time_is_named(tmp_path: Path, capsys) -> None:  # ty
     trace.write_text('{"t_ns": 900000000000000, "kind": "pose", "x": 0, "y": 0, "theta": 0}\n')
     assert main(["odometry", str(log), "--truth", str(trace)]) == 2
     assert "same monotonic clock" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"\xff\xfe", "t.jsonl:1: expected a line of edge-hil's trace"),
+        (b"[" * 100_000, "t.jsonl:1: expected a line of edge-hil's trace (nested too deeply)"),
+        (b'{"kind": "pose", "t_ns": 1e400, "x": 0, "y": 0, "theta": 0}', "t.jsonl:1: expected a line"),
+        (b'{"kind": "pose", "t_ns": 1, "x": 1%b, "y": 0, "theta": 0}' % (b"0" * 400), "an integer of 1329 bits"),
+        (b'{"kind": "pose", "t_ns": 1, "x": 1e400, "y": 0, "theta": 0}', "pose (inf, 0.0, 0.0) is not finite"),
+        (None, "is not a regular file"),
+    ],
+    ids=["not UTF-8", "deep", "endless stamp", "integer of 401 digits", "endless pose", "FIFO"],
+)
+def test_a_truth_that_cannot_be_read_is_one_clear_line(
+    content: bytes | None, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, trace = write_log(tmp_path / "d.mcap", drive(5)), tmp_path / "t.jsonl"
+    if content is None:
+        os.mkfifo(trace)
+    else:
+        trace.write_bytes(content)
+    assert main(["odometry", str(log), "--truth", str(trace)]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
 
 
 def test_a_calibration_reads_back_as_written(tmp_path: Path) -> None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -14,7 +16,7 @@ import cv2
 import pytest
 
 from sim_hil.benchmark import cli
-from sim_hil.benchmark.results.store import read_results
+from sim_hil.benchmark.results.store import StoreError, read_results
 from tests.support.benchmark import dynanav_fakes as fakes
 from tests.support.processes import REPOSITORY
 
@@ -114,6 +116,26 @@ def test_without_an_output_directory_the_result_is_only_printed(
     assert cli.main(["--suite", str(suite), "--episodes", "walk-1", "--policy", "still", "--json", "-"]) == 0
     (episode,) = json.loads(capsys.readouterr().out)["episodes"]
     assert episode["end"] == "timeout" and episode["path_m"] < 0.05
+
+
+def test_signals_wait_until_the_temporary_folder_is_removed(
+    suite: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    handlers, remove = list[object](), shutil.rmtree
+
+    def removed(folder: Path, **_: object) -> None:
+        handlers.append(signal.getsignal(signal.SIGTERM))
+        remove(folder)
+
+    def fail(*_: object, **__: object) -> None:
+        raise StoreError("made up")
+
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(cli, "execute", fail)
+    monkeypatch.setattr("sim_hil.benchmark.cli.shutil.rmtree", removed)
+    assert cli.main(["--suite", str(suite), "--episodes", "walk-1", "--policy", "still"]) == 2
+    assert len(handlers) == 1 and handlers[0] is not signal.SIG_DFL
+    assert list(tmp_path.glob("edge-bench-*")) == []
 
 
 @pytest.mark.parametrize(

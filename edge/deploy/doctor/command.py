@@ -48,12 +48,12 @@ from firmware_bridge.core.config import ConfigError, RobotConfig, load_robot_con
 from firmware_bridge.system.terminal import CommandParser
 
 if TYPE_CHECKING:
-    from edge.inference.policy import Policy  # needs ONNX Runtime
+    from edge.inference.warm_up import Opened  # needs ONNX Runtime
 
 EXAMPLES = """examples:
   edge-doctor --artifacts out/orin --robot go2.toml
   edge-doctor --artifacts out/orin --target orin --json -
-  sudo edge-doctor --artifacts /opt/tic-vla/orin --robot /etc/tic-vla/go2.toml \\
+  sudo edge-doctor --artifacts /opt/tic-vla-edge/current/artifacts --robot /etc/tic-vla-edge/go2.toml \\
        --socket /run/tic-vla-edge/bridge.sock --user tic-vla-runner
   edge-doctor
 
@@ -258,31 +258,33 @@ def _graphs(args: argparse.Namespace, artifacts: Artifacts | None, plan: PlanFac
         artifacts = engines.with_engines(artifacts, folder)
     from edge.deploy.doctor import graphs as doctor_graphs  # needs ONNX Runtime
 
-    # First: profiling has no limits of time and memory.
-    tested, policy = doctor_graphs.self_test(artifacts)
+    tested, opened = doctor_graphs.self_test(artifacts)
     yield tested
-    if policy is None:
+    if opened is None:
         for name in ("providers of the graphs", "tick"):
             yield skipped(name, "the self-test failed")
         return
-    placed = [doctor_graphs.profile_graph(artifacts, name) for name in artifacts.graphs]
+    placed = [doctor_graphs.profile_graph(artifacts, name, opened.guard) for name in artifacts.graphs]
     yield from placed
     if failed(placed):
         yield skipped("tick", "a graph does not run as it should")
     elif args.ticks == 0:
         yield skipped("tick", "--ticks 0")
     else:
-        yield _tick(args, policy, plan)
+        yield _tick(args, opened, plan)
 
 
-def _tick(args: argparse.Namespace, policy: Policy, plan: PlanFacts | None) -> Check:
+def _tick(args: argparse.Namespace, opened: Opened, plan: PlanFacts | None) -> Check:
     from edge.deploy.doctor import graphs as doctor_graphs  # needs ONNX Runtime
+    from edge.inference.start_guard import WARM_UP_S
 
+    policy = opened.policy
     runtime = policy.artifacts.runtime
-    prompt = runtime.frame_tokens if plan is None else plan.prompt_tokens
+    prompt = min(runtime.frame_tokens if plan is None else plan.prompt_tokens, runtime.max_context)
     try:
-        times_ms = doctor_graphs.measure_ticks(policy, args.ticks, TICK_BUDGET_S, min(prompt, runtime.max_context))
-    except GraphError as error:
+        with opened.guard.stage("ticks", WARM_UP_S):
+            times_ms = doctor_graphs.measure_ticks(policy, args.ticks, TICK_BUDGET_S, prompt)
+    except (GraphError, ArtifactError) as error:
         return Check("tick", Level.FAIL, str(error), "a tick that runs", "edge-export verify DIR names what is wrong")
     return doctor_graphs.judge_ticks(times_ms, plan, runtime.tick_period_ms)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import tempfile
 import time
@@ -16,11 +17,13 @@ import onnxruntime as ort
 from edge.artifacts.files import ArtifactError
 from edge.artifacts.manifest import Artifacts, GraphContract
 from edge.artifacts.target_facts import PlanFacts
+from edge.core.cli import EXIT_CHECK_FAILED
 from edge.core.geometry import SE2
 from edge.deploy.doctor.check import Check, Level, skipped
-from edge.inference.graph import CPU_PROVIDER, Array, session_settings, zeros
+from edge.inference.graph import CPU_PROVIDER, Array, CancelledError, Interrupt, session_settings, zeros
 from edge.inference.policy import Policy
-from edge.inference.warm_up import open_proven
+from edge.inference.start_guard import WARM_UP_S, StartGuard, end_process
+from edge.inference.warm_up import Opened, open_proven
 from edge.state.semantic import STRAIGHT_AHEAD, SemanticState
 
 SHAPE_OPERATORS: Final = frozenset(
@@ -93,8 +96,16 @@ def _harmless(place: Placement) -> bool:
     return place.provider == CPU_PROVIDER and (small or place.operator in COPIES)
 
 
-def profile_graph(artifacts: Artifacts, name: str) -> Check:
-    """Open a graph as the runner does, run it once under ONNX Runtime's profiler and check its nodes' providers."""
+def guarded(artifacts: Artifacts) -> StartGuard:
+    """Return limits whose last resort ends the command as a failed check does."""
+    return StartGuard(artifacts, end=functools.partial(end_process, code=EXIT_CHECK_FAILED))
+
+
+def profile_graph(artifacts: Artifacts, name: str, guard: StartGuard) -> Check:
+    """Open a graph as the runner does, run it once under ONNX Runtime's profiler and check its nodes' providers.
+
+    `guard` limits time and memory: a graph that passes the self-test may loop on other inputs.
+    """
     contract = artifacts.graphs[name]
     wanted = contract.session.provider
     with tempfile.TemporaryDirectory(prefix="edge-doctor-") as folder:
@@ -102,14 +113,24 @@ def profile_graph(artifacts: Artifacts, name: str) -> Check:
         options.enable_profiling = True
         options.profile_file_prefix = str(Path(folder) / "profile")
         try:
-            session = ort.InferenceSession(artifacts.contents[contract.file], options, providers=providers)
-            session.run(None, example_feeds(artifacts, contract))
+            with guard.stage(f"profile of {name}", WARM_UP_S):
+                session = ort.InferenceSession(artifacts.contents[contract.file], options, providers=providers)
+                _run_once(session, example_feeds(artifacts, contract), guard.interrupt)
             events = json.loads(Path(session.end_profiling()).read_text(encoding="utf-8"))
             return judge_placement(name, wanted, placements(events))
         except Exception as error:  # noqa: BLE001 - ONNX Runtime raises any error of its providers; that is the finding
             reason = (str(error).splitlines() or [type(error).__name__])[0]
             advice = "verify the artifacts (edge-export verify), then the provider's packages"
             return Check(f"provider of {name}", Level.FAIL, f"does not run: {reason}", wanted, advice)
+
+
+def _run_once(session: ort.InferenceSession, feeds: dict[str, Array], interrupt: Interrupt) -> None:
+    try:
+        session.run(None, feeds, interrupt.options)
+    except Exception as error:  # ONNX Runtime raises any error of its providers
+        if interrupt.is_set:
+            raise CancelledError("ended by its limit") from error
+        raise
 
 
 def example_feeds(artifacts: Artifacts, contract: GraphContract) -> dict[str, Array]:
@@ -121,16 +142,16 @@ def example_feeds(artifacts: Artifacts, contract: GraphContract) -> dict[str, Ar
     return feeds
 
 
-def self_test(artifacts: Artifacts) -> tuple[Check, Policy | None]:
-    """Run the runner's self-test; return its check and the opened policy, None after a failure."""
+def self_test(artifacts: Artifacts) -> tuple[Check, Opened | None]:
+    """Run the runner's self-test; return its check and the opened graphs, None after a failure."""
     name, known = "self-test", artifacts.known_answers
     expected = "the exporter's answers" if known is None else f"the exporter's answers within {known.limit_s:g} s"
     try:
-        opened = open_proven(artifacts)
+        opened = open_proven(artifacts, guard=guarded(artifacts))
     except ArtifactError as error:
         problem, _, advice = str(error).rpartition("; ")
         return Check(name, Level.FAIL, problem or advice, expected, advice), None
-    return Check(name, Level.OK, str(opened.tested), expected), opened.policy
+    return Check(name, Level.OK, str(opened.tested), expected), opened
 
 
 def measure_ticks(policy: Policy, count: int, budget_s: float, prompt_tokens: int) -> list[float]:

@@ -35,9 +35,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ArtifactError, engines.EngineError) as error:
         sys.stderr.write(f"edge-export: {one_line(error)}\n")
         return EXIT_REFUSED
-    checks = [self_test(artifacts)[0]]
-    if checks[0].level is not Level.FAIL:  # a graph that fails may also loop
-        checks += [profile_graph(artifacts, name) for name in artifacts.graphs]
+    tested, opened = self_test(artifacts)
+    checks = [tested]
+    if opened is not None:  # a graph that fails may also loop
+        checks += [profile_graph(artifacts, name, opened.guard) for name in artifacts.graphs]
     for check in checks:
         sys.stderr.write(f"edge-export: {check.name}: {check.found}\n")
     sys.stderr.write("edge-export: hashes and contract hold; the gates were not repeated: torch is not installed\n")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -320,3 +321,14 @@ class TestFilesAndGraphs:
 def test_a_call_chooses_2_to_16_tokens() -> None:
     """As the graphs that `edge-export` writes; latency profiles are checked against the same."""
     assert (LEAST_ROWS, MOST_ROWS) == (2, 16)
+
+
+def test_a_directory_that_cannot_be_listed_is_refused(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As one of mode 0311: its files can be opened by name. The tests may run as root, which may list everything."""
+
+    def closed(self: Path) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "iterdir", closed)
+    with pytest.raises(ArtifactError, match=r"nano: cannot be listed \(Permission denied\)"):
+        load_artifacts(copy)

@@ -6,7 +6,8 @@ import argparse
 import dataclasses
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,20 +16,22 @@ import numpy as np
 import pytest
 
 from edge.artifacts.files import ArtifactError, seal
-from edge.artifacts.manifest import Artifacts
+from edge.artifacts.manifest import Artifacts, load_artifacts
 from edge.artifacts.target_facts import GIB, PlanFacts, plan_facts, target_facts
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE
 from edge.core.device import CUDA, OPENVINO
 from edge.deploy.doctor.check import Check, Level
 from edge.deploy.doctor.command import examine, main, parser
-from edge.deploy.doctor.graphs import Placement, judge_placement, judge_ticks, placements, profile_graph
+from edge.deploy.doctor.graphs import Placement, guarded, judge_placement, judge_ticks, placements, profile_graph
 from edge.deploy.doctor.robot import bridge, robot_link
 from edge.inference.graph import CPU_PROVIDER
+from edge.inference.start_guard import StartGuard
 from edge.run.robot_reader import RobotCamera
 from export.targets.file import load_target
 from firmware_bridge.core.config import RobotConfig, load_robot_config
 from firmware_bridge.core.link import BridgeStatus
 from firmware_bridge.core.robot_state import CameraError, DdsError
+from tests.edge.inference.test_self_test import loop_for_ever
 from tests.support.processes import GO2_SIM
 
 PLAN = PlanFacts(100.0, 60.0, 40.0, 0.2, 1100, 4 * GIB, "modelled")
@@ -80,7 +83,7 @@ def test_only_nodes_that_compute_shapes_may_run_on_the_processor(
 
 
 def test_every_graph_of_real_artifacts_runs_on_its_manifests_provider(artifacts: Artifacts) -> None:
-    checks = [profile_graph(artifacts, name) for name in artifacts.graphs]
+    checks = [profile_graph(artifacts, name, guarded(artifacts)) for name in artifacts.graphs]
     assert [check.level for check in checks] == [Level.OK] * len(artifacts.graphs), checks
 
 
@@ -89,10 +92,27 @@ def test_a_graph_that_onnx_runtime_quietly_runs_on_the_processor_instead_fails(a
     graph = artifacts.graphs["action_expert"]
     moved = dataclasses.replace(graph, session=dataclasses.replace(graph.session, provider=CUDA))
     check = profile_graph(
-        dataclasses.replace(artifacts, graphs={**artifacts.graphs, "action_expert": moved}), "action_expert"
+        dataclasses.replace(artifacts, graphs={**artifacts.graphs, "action_expert": moved}),
+        "action_expert",
+        guarded(artifacts),
     )
     assert check.level is Level.FAIL
     assert "nodes on CPUExecutionProvider" in check.found
+
+
+def test_a_graph_that_loops_does_not_hang_the_profile(artifacts_dir: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))
+    loop_for_ever(copy)
+
+    class Impatient(StartGuard):
+        @contextmanager
+        def stage(self, what: str, limit_s: float) -> Iterator[None]:
+            with super().stage(what, min(limit_s, 0.5)):
+                yield
+
+    looping = load_artifacts(copy)
+    check = profile_graph(looping, "action_expert", Impatient(looping, end=lambda _line: None))
+    assert check.level is Level.FAIL and "profile of action_expert: not done after its limit" in check.found
 
 
 def test_a_graph_is_profiled_with_the_options_that_the_runner_gives_to_its_provider(
@@ -108,7 +128,7 @@ def test_a_graph_is_profiled_with_the_options_that_the_runner_gives_to_its_provi
         raise RuntimeError("no such library")
 
     monkeypatch.setattr("onnxruntime.InferenceSession", refuse)
-    check = profile_graph(dataclasses.replace(artifacts, graphs=moved), "vision_encoder")
+    check = profile_graph(dataclasses.replace(artifacts, graphs=moved), "vision_encoder", guarded(artifacts))
     assert check.level is Level.FAIL and "no such library" in check.found
     ((options, providers),) = opened
     hint = '{"CPU": {"INFERENCE_PRECISION_HINT": "bf16"}}'

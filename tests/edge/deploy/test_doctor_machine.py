@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import datetime
 import io
+import subprocess
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -310,6 +312,16 @@ def test_the_watchdog_is_written_for_systemd(board: Path) -> None:
 def test_the_power_mode_is_stored_by_its_number(board: Path) -> None:
     ran: list[list[str]] = []
     assert setting(board, [], ran, power_mode="25W") == 0 and ran == [["nvpmodel", "-m", "2"]]
+
+
+def test_a_power_tool_that_hangs_is_one_clear_line(board: Path) -> None:
+    def hang(words: Sequence[str]) -> tuple[int, str]:
+        raise subprocess.TimeoutExpired(list(words), 60.0)
+
+    lines: list[str] = []
+    args = argparse.Namespace(watchdog=None, power_mode="25W", dry_run=False)
+    assert boot.run(args, lines.append, board, hang) == 1
+    assert lines[-1].startswith("nvpmodel -m 2: expected an answer within 60 s, found none")
 
 
 def test_a_dry_run_changes_nothing(board: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from edge.deploy.pins import FILE, PinsError, parse_pins, pinned_steps, pins_of, read_pins
+from edge.deploy.pins import FILE, PinsError, parse_pins, pinned_steps, pins_of, read_pins, wheel_extras
 
 HASHED = Path(__file__).resolve().parents[3] / "constraints-hashed.txt"
 SHIPPED = HASHED.read_text(encoding="utf-8")
@@ -45,6 +45,21 @@ def test_a_file_without_hashes_is_refused(text: str, tmp_path: Path) -> None:
         archive.writestr(FILE, text)
     with pytest.raises(PinsError):
         read_pins(tmp_path / "x.whl")
+
+
+@pytest.mark.parametrize("damage", ["deflate", "metadata"])
+def test_a_damaged_wheel_is_refused(damage: str, tmp_path: Path) -> None:
+    wheel, name = tmp_path / "x.whl", "x.dist-info/METADATA"
+    content = b"\xff\xfe" if damage == "metadata" else b"Name: tic-vla-edge\n" * 100
+    with zipfile.ZipFile(wheel, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(name, content)
+    if damage == "deflate":
+        data = bytearray(wheel.read_bytes())
+        begin = data.index(name.encode()) + len(name)
+        data[begin] = 0xFF  # a block of a reserved type
+        wheel.write_bytes(bytes(data))
+    with pytest.raises(PinsError, match=r"not a whole wheel .*copy it again"):
+        wheel_extras(wheel)
 
 
 def test_pip_installs_pins_by_hash_and_resolves_nothing_itself(tmp_path: Path) -> None:

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import subprocess
 import sys
+import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import zstandard
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mcap.data_stream import RecordBuilder
+from mcap.records import Chunk
+from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, IndexType, Writer
 
 from edge.flightlog.reader import RecordingError, read_messages
 from edge.flightlog.recorder import Recorder
@@ -79,3 +87,61 @@ def test_a_file_that_is_no_recording_is_refused_by_name(tmp_path: Path) -> None:
     path.write_text("hello, this is not MCAP")
     with pytest.raises(RecordingError, match=r"notes\.txt is not an MCAP file"):
         list(read_messages(path))
+
+
+def _written(path: Path, compression: CompressionType, *messages: bytes) -> bytes:
+    """Write an MCAP file with these messages in one chunk; return its bytes."""
+    with path.open("wb") as stream:
+        writer = Writer(stream, compression=compression, index_types=IndexType.NONE, use_statistics=False)
+        writer.start()
+        channel = writer.register_channel("/tick", "json", 0)
+        for number, data in enumerate(messages):
+            writer.add_message(channel, number, data, number)
+        writer.finish()
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"[" * 100_000, b'{"n": 1' + b"0" * 5000 + b"}", b"5", b"[]", b'{"a": "\xff"}'],
+    ids=["nested too deeply", "integer of 5001 digits", "number", "list", "not UTF-8"],
+)
+def test_a_part_ends_quietly_at_a_message_that_is_no_json_object(data: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    _written(path, CompressionType.ZSTD, b'{"tick": 1}', data, b'{"tick": 2}')
+    assert [payload for _, _, payload in read_messages(path)] == [{"tick": 1}]
+
+
+@pytest.mark.parametrize("compression", [CompressionType.LZ4, CompressionType.ZSTD])
+def test_a_compressed_chunk_is_read_and_a_cut_one_ends_the_part(compression: CompressionType, tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    whole = _written(path, compression, b'{"tick": 1}')
+    assert [payload for _, _, payload in read_messages(path)] == [{"tick": 1}]
+    reader = StreamReader(io.BytesIO(whole), emit_chunks=True)
+    chunk = next(record for record in reader.records if isinstance(record, Chunk))
+    _write_chunk(path, replace(chunk, data=chunk.data[:-9]))
+    assert list(read_messages(path)) == []
+
+
+@pytest.mark.parametrize("stated", [1000, 1 << 31])
+def test_a_chunk_of_kilobytes_that_expands_to_gigabytes_takes_no_memory(stated: int, tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    data = zstandard.ZstdCompressor().compress(bytes(1 << 28))  # its header states its size
+    assert len(data) < 100_000
+    chunk = Chunk(
+        compression="zstd", data=data, message_end_time=0, message_start_time=0, uncompressed_crc=0,
+        uncompressed_size=stated,
+    )  # fmt: skip
+    _write_chunk(path, chunk)
+    tracemalloc.start()
+    try:
+        assert list(read_messages(path)) == []
+        assert tracemalloc.get_traced_memory()[1] < 8_000_000
+    finally:
+        tracemalloc.stop()
+
+
+def _write_chunk(path: Path, chunk: Chunk) -> None:
+    builder = RecordBuilder()
+    chunk.write(builder)
+    path.write_bytes(b"\x89MCAP0\r\n" + builder.end())

@@ -9,12 +9,15 @@ from typing import Any
 
 import pytest
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from export.checkpoint.layouts import VLM_LAYOUTS
 from export.checkpoint.load import load_checkpoint
 from export.checkpoint.tokenizer import tokenizer_for
+from export.evaluation import parity
+from export.model import weights
 from export.model.config import PRESETS
 from export.model.network import TicVla, build
 from export.model.weights import CheckpointError, WeightsInfo, save_weights, weights_sha256
@@ -260,3 +263,21 @@ def test_another_version_of_our_format_is_refused(model: TicVla, tmp_path: Path)
     path = tmp_path / "nano.safetensors"
     save_file(model.state_dict(), str(path), metadata={"format": "tic-vla-edge/2"})
     assert "format 'tic-vla-edge/2', expected 'tic-vla-edge/1'" in refusal(path)
+
+
+@pytest.mark.parametrize("module", [weights, parity], ids=["weights", "samples"])
+def test_a_full_disk_is_an_os_error_and_leaves_no_file(
+    module: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_tensors: object, path: str | Path, **_: object) -> None:
+        Path(path).write_bytes(b"half")
+        raise SafetensorError("Error while serializing: I/O error: No space left on device (os error 28)")
+
+    monkeypatch.setattr(module, "save_file", full)
+    path = tmp_path / "w.safetensors"
+    with pytest.raises(OSError, match=r"No space left on device.*w\.safetensors"):
+        if module is weights:
+            save_weights(build(NANO, 0), path, WeightsInfo(True, ""))
+        else:
+            parity.save_samples([], path)
+    assert list(tmp_path.iterdir()) == []

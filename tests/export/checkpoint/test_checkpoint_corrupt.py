@@ -6,6 +6,7 @@ import json
 import os
 import pickle  # noqa: TID251 - planted in files to be refused, never loaded
 import struct
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -144,6 +145,22 @@ def test_a_link_out_of_the_directory_is_refused(vlm: Path, tmp_path: Path, name:
     (vlm / name).rename(tmp_path / "elsewhere")
     (vlm / name).symlink_to(tmp_path / "elsewhere")
     assert "a link that leads out of the directory" in refusal(vlm)
+
+
+def test_a_loop_of_links_is_no_file(vlm: Path) -> None:
+    config = vlm / "config.json"
+    config.unlink()
+    config.symlink_to("config.json")
+    assert "config.json: no such file" in refusal(vlm)
+
+
+def test_a_header_of_a_million_tensors_of_one_name_is_refused_at_once(tmp_path: Path) -> None:
+    names = [f'"{number}":0' for number in range(300_000)]
+    path = tmp_path / "bad.safetensors"
+    path.write_bytes(header(b"{%b}" % ",".join([*names, names[-1]]).encode()))
+    begun_ns = time.monotonic_ns()
+    assert "299999 occurs twice" in refusal(path)
+    assert time.monotonic_ns() - begun_ns < 5_000_000_000  # a comparison of all pairs takes minutes
 
 
 def test_the_links_of_the_hub_cache_are_followed(vlm: Path, tmp_path: Path) -> None:

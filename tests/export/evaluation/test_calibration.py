@@ -175,6 +175,15 @@ def test_a_folder_with_too_few_images_is_refused(tmp_path: Path, count: int) -> 
         load_calibration(f"folder:{_folder(tmp_path / 'mine', count)}")
 
 
+def test_a_huge_sparse_image_in_a_folder_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    for number in range(21):
+        (tmp_path / f"{number:02d}.png").touch()
+    with (tmp_path / "00.png").open("r+b") as file:
+        file.truncate(1 << 42)
+    with pytest.raises(CalibrationError, match=r"cannot be read .*is larger than"):
+        load_calibration(f"folder:{tmp_path}")
+
+
 def test_an_unreadable_image_in_a_folder_is_named(tmp_path: Path) -> None:
     folder = _folder(tmp_path / "mine")
     (folder / "005.png").write_bytes(b"\x89PNG")

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from edge.artifacts.files import SCHEMA_VERSION, SECTIONS, ArtifactError, seal
 from edge.artifacts.manifest import load_artifacts
 from export.cli import main
 from export.core.cache import StageCache
-from export.pipeline.artifacts import build_artifacts, workplace
+from export.pipeline.artifacts import build_artifacts, check_replaceable, workplace
 from tests.support.export.export_job import job, manifest, progress
 
 
@@ -88,6 +91,24 @@ def test_an_older_directory_of_ours_is_replaced_if_its_files_match_its_manifest(
     (out / "tokenizer.json").write_bytes(tokenizer)
     assert main(["--out", str(out)]) == 0
     load_artifacts(out)
+
+
+@pytest.mark.parametrize("name", ["/dev/zero", "../out/fifo", "fifo", "link"])
+def test_an_older_manifest_that_lists_a_device_or_a_link_is_refused_at_once(name: str, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    os.mkfifo(out / "fifo")
+    (out / "link").symlink_to("/dev/zero")
+    (out / "manifest.json").write_text(json.dumps({"schema_version": 1, "files": {name: {"sha256": "0" * 64}}}))
+    with pytest.raises(ArtifactError, match="schema version 1"):
+        check_replaceable(out)
+
+
+def test_a_sealed_manifest_whose_files_are_a_number_is_refused(tmp_path: Path) -> None:
+    content: dict[str, Any] = {**{key: {} for key in SECTIONS}, "schema_version": SCHEMA_VERSION, "files": 5}
+    (tmp_path / "manifest.json").write_text(json.dumps(seal(content)))
+    with pytest.raises(ArtifactError, match=r"manifest\.json: files must be an object"):
+        check_replaceable(tmp_path)
 
 
 @pytest.mark.slow

@@ -216,7 +216,10 @@ def _set(content: dict[str, Any], kinds: Mapping[str, type], setting: str) -> No
         raise RecipeError(f"[{section}]: expected a table, found {table!r}")
     for name in path[:-1]:
         kind = _fields_of(kind).get(name)
-        table[name] = dict(table.get(name, {}))
+        below = table.get(name, {})
+        if not isinstance(below, dict):
+            raise RecipeError(f"{where}: {name} is a value ({below!r:.40}), so no key is expected below it")
+        table[name] = dict(below)
         table = table[name]
     known = _fields_of(kind)
     if path[-1] not in known:

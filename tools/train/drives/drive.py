@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -23,6 +22,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from edge.core.geometry import SE2
+from export.core.tensor_file import replacing
 from firmware_bridge.system.input_file import read_json
 from tools.train.config.checks import TrainError
 from tools.train.config.collect import TRACE_EVERY
@@ -195,10 +195,9 @@ class Drive:
     def save(self, path: Path) -> None:
         """Write the file atomically. Raises OSError."""
         arrays = {name: np.ascontiguousarray(getattr(self, name)) for name in ("jpeg", *_ARRAYS)}
-        partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
         text = json.dumps({"format": FORMAT, **asdict(self.about)}, sort_keys=True, separators=(",", ":"))
-        save_file(arrays, partial, metadata={_KEY: text})
-        partial.replace(path)
+        with replacing(path) as partial:
+            save_file(arrays, partial, metadata={_KEY: text})
 
     @staticmethod
     def load(path: Path, *, pictures: bool = True) -> Drive:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save_file
 
+from export.core.tensor_file import replacing
 from export.core.typed import build
 from sim_hil.benchmark.language.openings import LINEAR, bounds_of
 from sim_hil.benchmark.language.visibility import ASPECT
@@ -211,10 +212,8 @@ def render(folder: Path, shard: Shard) -> Iterator[int]:
             if (k + 1) % _SAY_EVERY == 0:
                 yield k + 1
     ends = np.cumsum([len(each) for each in pictures])
-    path = path_of(folder, shard.name)
-    partial = path.with_name(f"{path.name}.partial")
-    save_file({"jpeg": np.concatenate(pictures), "jpeg_end": ends.astype(np.int64), **columns}, partial)
-    partial.replace(path)
+    with replacing(path_of(folder, shard.name)) as partial:
+        save_file({"jpeg": np.concatenate(pictures), "jpeg_end": ends.astype(np.int64), **columns}, partial)
     finish(folder, shard)
     yield shard.frames
 

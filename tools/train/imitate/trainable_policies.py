@@ -13,6 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from export.core.tensor_file import replacing
 from export.model.action import ActionExpert
 from export.model.attention import projection
 from export.model.config import TicVlaConfig
@@ -81,12 +82,10 @@ def build_point_goal(config: TicVlaConfig, generator: torch.Generator) -> PointG
 
 def save_point_goal(network: PointGoalNet, path: Path, origin: str) -> None:
     """Write the weights atomically. Raises OSError."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in network.state_dict().items()}
     about = {"format": FORMAT, "config": network.config.to_dict(), "origin": origin}
-    save_file(tensors, str(partial), metadata={_KEY: json.dumps(about, sort_keys=True)})
-    partial.replace(path)
+    with replacing(path) as partial:
+        save_file(tensors, str(partial), metadata={_KEY: json.dumps(about, sort_keys=True)})
 
 
 def load_point_goal(path: Path, config: TicVlaConfig) -> PointGoalNet:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from edge.core.cli import write_whole
-from firmware_bridge.system.input_file import read_json
 from sim_hil.benchmark.conditions.conditions import Conditions, PolicySpec
 from sim_hil.benchmark.conditions.latency import LatencyProfile
 from sim_hil.benchmark.results.record import EpisodeResult
@@ -24,6 +23,7 @@ from tools.train.config.rl import EvaluateConfig
 from tools.train.drives.scenarios import training_episodes
 from tools.train.run.job import StageJob
 from tools.train.run.network_file import export_artifacts, weights_before
+from tools.train.run.run_dir import read_record
 
 STAGE: Final = "evaluate"
 SUITE: Final = "training.toml"
@@ -75,7 +75,7 @@ def write_suite(folder: Path, config: EvaluateConfig) -> Path:
     path, mark = folder / SUITE, (folder / SUITE).with_suffix(".json")
     numbers = {"episodes": config.episodes, "scenario_seed": config.scenario_seed, "kinds": dict(config.kinds)}
     if path.exists() and mark.exists():
-        if (found := read_json(mark)) != numbers:
+        if (found := read_record(mark)) != numbers:
             raise TrainError(f"{path}: expected episodes of {numbers}, found {found}; delete {folder} to start again")
         return path
     scenes = folder / "scenes"

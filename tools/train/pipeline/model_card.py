@@ -10,7 +10,7 @@ from math import prod
 from pathlib import Path
 from typing import Any, Final
 
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 
 from edge.core.cli import write_whole
 from export.model.network import PARTS
@@ -23,7 +23,7 @@ from tools.train.config.recipe import STAGES, Recipe
 from tools.train.drives.drive import file_sha256
 from tools.train.pipeline.chain import ADOPTED, GO_ON
 from tools.train.run.network_file import CARD, START, START_CARD, read_network, stage_weights
-from tools.train.run.run_dir import IMPORTED, VERSIONS, RunDir
+from tools.train.run.run_dir import IMPORTED, VERSIONS, RunDir, read_record
 
 _PART_NAMES: Final = dict(
     zip(PARTS, ("vision encoder", "language model", "action expert", "value network"), strict=True)
@@ -75,11 +75,11 @@ def ship(run_dir: RunDir, recipe: Recipe, folder: Path, scores: Sequence[Path] =
     """
     if not run_dir.model_path.is_file():
         raise TrainError(f"{run_dir.out}: no {run_dir.model_path.name} yet; train first")
-    with safe_open(str(run_dir.model_path), framework="pt") as file:
-        about = file.metadata()
     model = read_network(run_dir.model_path, recipe.model, recipe.seed).half()
+    with safe_open(str(run_dir.model_path), framework="pt") as file:
+        about = file.metadata() or {}
     path = folder / f"{recipe.model.name}.safetensors"
-    info = WeightsInfo(trained=about["trained"] == "true", origin=f"{about['origin']}, float16")
+    info = WeightsInfo(trained=about.get("trained") == "true", origin=f"{about.get('origin', 'unknown')}, float16")
     save_weights(model, path, info, parts=[part for part in PARTS if part != "value"])
     write_whole(path.with_suffix(".md"), card(run_dir, recipe, path, [score(each) for each in scores]))
     write_whole(path.with_suffix(_SHIPPED_RECIPE), run_dir.recipe_path.read_text(encoding="utf-8"))
@@ -132,7 +132,8 @@ def score(path: Path) -> dict[str, Any]:
         found = {key: content[key] for key in ("suite", "conditions", "summary", "latency", "trained")}
         found["conditions"] = Conditions.of_json(content["conditions"])
         finished = content["summary"]["finished"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        _scores(None, [found])  # whatever the card reads of it
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise TrainError(f"--scores {path}: expected a result.json of edge-bench ({error!r})") from error
     if not finished:
         raise TrainError(f"--scores {path}: expected a finished run; continue it with edge-bench --resume")
@@ -140,11 +141,14 @@ def score(path: Path) -> dict[str, Any]:
 
 
 def parameters(weights: Path) -> dict[str, int]:
-    """Count the weights of each part of the network."""
+    """Count the weights of each part of the network. Raises TrainError."""
     counts = dict.fromkeys(PARTS, 0)
-    with safe_open(str(weights), framework="pt") as file:
-        for name in file.keys():  # noqa: SIM118 — not a mapping
-            counts[name.split(".")[0]] += prod(file.get_slice(name).get_shape())
+    try:
+        with safe_open(str(weights), framework="pt") as file:
+            for name in file.keys():  # noqa: SIM118 — not a mapping
+                counts[name.split(".")[0]] += prod(file.get_slice(name).get_shape())
+    except (OSError, SafetensorError, KeyError) as error:
+        raise TrainError(f"{weights}: expected weights of edge-train, cannot be read ({error}); train again") from error
     return counts
 
 
@@ -166,8 +170,13 @@ def _scores(evaluation: Mapping[str, Any] | None, scores: Sequence[Mapping[str, 
         delay = "" if delay_s is None else f", mean Δt {delay_s:.2f} s"
         rows.append(_row(f"{Path(each['suite']).stem}, {each['conditions'].describe()}{delay}", each["summary"]))
     if evaluation is not None:
-        where = f"unseen training scenes, lockstep, async, latency {evaluation['latency_s']:g} s"
-        rows.append(_row(where, evaluation["summary"]))
+        try:
+            where = f"unseen training scenes, lockstep, async, latency {evaluation['latency_s']:g} s"
+            rows.append(_row(where, evaluation["summary"]))
+        except (LookupError, TypeError, ValueError) as error:
+            raise TrainError(
+                f"evaluate/result.json: expected latency_s and a summary ({error!r}); restore it"
+            ) from error
     if not rows:
         return "Not measured yet.\n"
     head = "| episodes of | n | SR % | SPL % | CR % | NE m |\n|---|---:|---:|---:|---:|---:|\n"
@@ -202,8 +211,10 @@ def _data(run_dir: RunDir, collected: Mapping[str, object] | None) -> str:
 def _training(
     run_dir: RunDir, recipe: Recipe, results: Mapping[str, Any], after: str | None, recipe_file: Path
 ) -> str:  # fmt: skip
-    versions = read_json(run_dir.out / VERSIONS)
-    packages = ", ".join(f"{name} {found}" for name, found in versions["packages"].items() if found)
+    versions = read_record(run_dir.out / VERSIONS)
+    if missing := {"packages", "python", "cpus", "machine"} - versions.keys():
+        raise TrainError(f"{run_dir.out / VERSIONS}: expected {', '.join(sorted(missing))} too; restore it")
+    packages = ", ".join(f"{name} {found}" for name, found in dict(versions["packages"]).items() if found)
     went_on = " --checkpoint WEIGHTS" if run_dir.begun(START) else ""
     went_on += "" if after is None else f" --after {after}"
     if results.get("collect", {}).get(IMPORTED) is True:

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
+from export.core.tensor_file import replacing
 from tools.train.config.checks import TrainError
 
 FORMAT: Final = "tic-vla-edge-rollout/1"
@@ -105,10 +106,8 @@ def save(path: Path, episodes: Sequence[tuple[EpisodeSteps, EpisodeEnd]]) -> Non
             arrays["semantic"] = np.concatenate(semantic).astype(np.float32)
             arrays["semantic_end"] = np.cumsum([len(each) for each in semantic]).astype(np.int64)
     ends = [asdict(end) for _, end in episodes]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    save_file(arrays, str(partial), metadata={"format": FORMAT, "ends": json.dumps(ends)})
-    partial.replace(path)
+    with replacing(path) as partial:
+        save_file(arrays, str(partial), metadata={"format": FORMAT, "ends": json.dumps(ends)})
 
 
 @dataclass(frozen=True)

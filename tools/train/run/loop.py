@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
@@ -19,6 +18,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from export.core.tensor_file import replacing
 from tools.train.config.checks import OptimConfig, TrainError
 from tools.train.run.distributed import SINGLE, Ranks
 from tools.train.run.job import StageJob
@@ -29,17 +29,10 @@ _KEYS: Final = ("format", "meta")
 
 def save_checkpoint(path: Path, tensors: Mapping[str, torch.Tensor], meta: Mapping[str, object]) -> None:
     """Write tensors (any device, dtype kept) and JSON atomically. On OSError the old file remains."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
     # Clone, because safetensors refuses tensors that share memory, such as tied weights.
     whole = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in tensors.items()}
-    try:
+    with replacing(path) as partial:
         save_file(whole, str(partial), metadata={"format": FORMAT, "meta": json.dumps(meta, sort_keys=True)})
-        with partial.open("rb") as file:
-            os.fsync(file.fileno())
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def load_checkpoint(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:

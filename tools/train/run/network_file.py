@@ -16,14 +16,15 @@ from safetensors import SafetensorError, safe_open
 from edge.artifacts.files import MANIFEST_NAME
 from edge.core.cli import EXIT_DONE, EXIT_INTERRUPTED, write_whole
 from export.checkpoint.load import load_checkpoint
+from export.core.tensor_file import replacing
 from export.model.config import PRESETS, ActionConfig, ModelConfigError, TicVlaConfig, config_from_dict
 from export.model.network import PARTS, TicVla, build
 from export.model.weights import WeightsInfo, save_weights
-from firmware_bridge.system.input_file import read_json
 from sim_hil.processes.child_process import last_lines
 from tools.train.config.checks import TrainError
 from tools.train.drives.drive import file_sha256
 from tools.train.run.job import StageJob
+from tools.train.run.run_dir import read_record
 
 START: Final = "start"
 """Folder of weights that the run started with."""
@@ -147,9 +148,8 @@ def finish_network(job: StageJob, stage: str, model: TicVla) -> Path:
     path = stage_weights(job.run_dir.out, stage)
     origin = f"edge-train {job.recipe.name}, seed {job.recipe.seed}, after {stage}"
     save_weights(model, path, WeightsInfo(trained=True, origin=origin))
-    partial = job.run_dir.model_path.with_suffix(".partial")
-    shutil.copyfile(path, partial)
-    partial.replace(job.run_dir.model_path)
+    with replacing(job.run_dir.model_path) as partial:
+        shutil.copyfile(path, partial)
     return path
 
 
@@ -168,10 +168,13 @@ def export_artifacts(
     log: Callable[[str], None] = lambda line: None,
     command: Sequence[str] = COMMAND,
 ) -> Path:
-    """Export into `out`, unless it contains these weights, and return it. Raises ExportError, KeyboardInterrupt."""
+    """Export into `out`, unless it contains these weights, and return it.
+
+    Raises ExportError, KeyboardInterrupt, TrainError for a damaged mark of an earlier export.
+    """
     digest, mark = file_sha256(weights), out.with_name(out.name + ".json")
     if (out / MANIFEST_NAME).is_file() and mark.is_file():
-        if read_json(mark).get("weights_sha256") == digest:
+        if read_record(mark).get("weights_sha256") == digest:
             return out
         mark.unlink()
     out.parent.mkdir(parents=True, exist_ok=True)

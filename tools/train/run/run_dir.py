@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from edge.core.cli import write_whole
 from export import model
-from firmware_bridge.system.input_file import read_json
+from firmware_bridge.system.input_file import parse_json, read_json
 from sim_hil.benchmark.workers.code_version import code_sha256
 from tools.train.config.checks import TrainError
 from tools.train.config.recipe import STAGES, Recipe, load_recipe
@@ -28,6 +28,7 @@ SHARED_PARTS: Final = ("vision", "language")
 """Parts of the network that --from takes from another run."""
 PACKAGES: Final = ("numpy", "torch", "onnxruntime", "opencv-python-headless", "tokenizers", "panda3d", "pybullet")
 """Packages whose versions affect a run's result."""
+_RESTORE: Final = "restore it, or train in another folder"
 
 
 class RunDir:
@@ -60,8 +61,10 @@ class RunDir:
     def _note_versions(self) -> None:
         """Write the versions that the run started with, and under `later` those that it was continued with."""
         path, now = self.out / VERSIONS, versions()
-        first = read_json(path) if path.exists() else None
+        first = read_record(path) if path.exists() else None
         later = [] if first is None else first.get("later", [])
+        if not isinstance(later, list):
+            raise TrainError(f"{path}: expected a list under 'later', found {later!r:.80}; {_RESTORE}")
         if first is None:
             first = now
         elif now not in ({key: value for key, value in first.items() if key != "later"}, *later):
@@ -143,19 +146,24 @@ class RunDir:
             write_whole(self.log_path, "".join(json.dumps(line) + "\n" for line in kept))
 
     def lines(self) -> Iterator[dict[str, Any]]:
-        """Yield the log's lines in order; an incomplete last line is left out."""
+        """Yield the log's lines in order; damaged ones, such as an incomplete last line, are left out."""
         if not self.log_path.exists():
             return
-        for line in self.log_path.read_text(encoding="utf-8").splitlines():
+        for text in self.log_path.read_bytes().splitlines():
             try:
-                yield json.loads(line)
+                line = parse_json(text)
             except ValueError:
                 continue
+            if isinstance(line, dict) and isinstance(line.get("stage"), str) and isinstance(line.get("step"), int):
+                yield line
 
     def timings(self) -> dict[str, float]:
-        """Return the seconds that each step has taken, including resumed parts."""
+        """Return the seconds that each step has taken, including resumed parts. Raises TrainError."""
         path = self.out / TIMINGS
-        return dict(read_json(path)) if path.exists() else {}
+        found = read_record(path) if path.exists() else {}
+        if not all(isinstance(seconds, int | float) for seconds in found.values()):
+            raise TrainError(f"{path}: expected seconds by step, found {found!r:.80}; delete it")
+        return found
 
     def add_time(self, step: str, seconds: float) -> None:
         """Add to the time of a step."""
@@ -164,13 +172,26 @@ class RunDir:
         write_whole(self.out / TIMINGS, json.dumps(timings, indent=1) + "\n")
 
     def result(self, stage: str) -> dict[str, Any] | None:
-        """Return the result of a finished stage; None if it has not finished."""
+        """Return the result of a finished stage; None if it has not finished. Raises TrainError."""
         path = self.out / stage / "result.json"
-        return read_json(path) if path.exists() else None
+        return read_record(path) if path.exists() else None
 
     def finish(self, stage: str, result: Mapping[str, object]) -> None:
         """Write the result of a stage, which marks it as finished."""
         write_whole(self.stage(stage) / "result.json", json.dumps(result, indent=1, sort_keys=True) + "\n")
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """Read a JSON object that a run wrote. Raises TrainError."""
+    try:
+        content = read_json(path)
+    except (OSError, ValueError) as error:
+        raise TrainError(
+            f"{path}: expected a JSON object of edge-train, cannot be read ({error}); {_RESTORE}"
+        ) from error
+    if not isinstance(content, dict):
+        raise TrainError(f"{path}: expected a JSON object of edge-train, found {content!r:.80}; {_RESTORE}")
+    return content
 
 
 def _difference(where: str, found: object, expected: object) -> str:

@@ -53,6 +53,7 @@ def test_a_setting_may_change_the_network() -> None:
         ("sft.epochs=many", "a whole number"),
         ("sft.epochs", "KEY=VALUE"),
         ("sft=3", "STAGE.field"),
+        ("sft.epochs.x=1", r"epochs is a value \(\d+\), so no key is expected below it"),
         ("model.action.layer=3", "not a number of the model"),
         ("sft.epochs=0", r"\[sft\]"),
         ("seed=-1", "seed from 0"),

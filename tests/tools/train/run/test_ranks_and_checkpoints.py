@@ -13,11 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors import SafetensorError
 
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 from export.model.config import PRESETS
 from tools.train.config.checks import OptimConfig, TrainError
 from tools.train.config.recipe import load_recipe
+from tools.train.run import loop
 from tools.train.run.distributed import autocast, computes_bf16
 from tools.train.run.loop import Optimiser, learning_rate, load_checkpoint, save_checkpoint, under, with_prefix
 from tools.train.run.run_dir import RunDir
@@ -53,6 +55,32 @@ def test_a_run_that_continues_with_other_code_reports_it_once(tmp_path: Path, mo
     versions = json.loads((made.out / "versions.json").read_text())
     later = versions.pop("later")
     assert versions == first and [each["code_sha256"]["simulation"] for each in later] == ["of tomorrow"]
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "[]", "{", "\udcff"], ids=["deep", "list", "cut", "not UTF-8"])
+@pytest.mark.parametrize("name", ["versions.json", "timings.json", "sft/result.json"])
+def test_a_damaged_file_of_a_run_is_one_clear_line(name: str, text: str, tmp_path: Path) -> None:
+    made = RunDir(tmp_path)
+    (made.stage("sft").parent / name).write_text(text, encoding="utf-8", errors="surrogateescape")
+    read = {"versions.json": made._note_versions, "timings.json": made.timings}.get(name, lambda: made.result("sft"))
+    with pytest.raises(TrainError, match=f"{name}: expected a JSON object of edge-train") as caught:
+        read()
+    assert "\n" not in str(caught.value)
+
+
+def test_timings_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "timings.json").write_text('{"sft": "long"}')
+    with pytest.raises(TrainError, match=r"timings\.json: expected seconds by step"):
+        RunDir(tmp_path).add_time("sft", 1.0)
+
+
+def test_damaged_lines_of_the_log_are_left_out(tmp_path: Path) -> None:
+    made = RunDir(tmp_path)
+    made.log("sft", 1, loss=0.5)
+    with made.log_path.open("ab") as file:
+        file.write(b'{"stage": "\xff"}\n[]\n{}\n' + b"[" * 100_000 + b"\n")
+    made.log("sft", 2, loss=0.25)
+    assert [line["step"] for line in made.lines()] == [1, 2]
 
 
 @pytest.mark.slow
@@ -175,6 +203,21 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(tmp_path: Pat
     save_checkpoint(path, {"a": torch.ones(1)}, {})
     with pytest.raises(TypeError):
         save_checkpoint(path, {"a": torch.zeros(1)}, {"no JSON": object()})
+    assert load_checkpoint(path)[0]["a"] == 1 and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_full_disk_is_an_os_error_and_leaves_the_checkpoint_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "c"
+    save_checkpoint(path, {"a": torch.ones(1)}, {})
+
+    def full(*_: object, **__: object) -> None:
+        raise SafetensorError("Error while serializing: I/O error: No space left on device (os error 28)")
+
+    monkeypatch.setattr(loop, "save_file", full)
+    with pytest.raises(OSError, match=f"No space left on device.*{path}"):
+        save_checkpoint(path, {"a": torch.zeros(1)}, {})
     assert load_checkpoint(path)[0]["a"] == 1 and list(tmp_path.iterdir()) == [path]
 
 
