@@ -156,6 +156,7 @@ def test_graphs_that_the_self_test_has_not_proven_are_not_measured(artifacts: Ar
         measured(dataclasses.replace(artifacts, known_answers=None))
 
 
+@pytest.mark.slow
 def test_a_control_thread_that_dies_ends_the_measurement(artifacts: Artifacts, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise ValueError("no picture")

@@ -74,6 +74,7 @@ def test_parameters_that_the_drive_does_not_excite_stay_uncertain(known: tuple[P
     assert load_calibration(out).scale_y_sigma > 0.03
 
 
+@pytest.mark.slow
 def test_the_camera_is_reference_enough() -> None:
     path = drive(13.2, scale=1.05, wz_radps=0.05)
     texture = floor_texture()

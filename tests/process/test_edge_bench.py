@@ -66,6 +66,7 @@ def test_an_interrupted_run_of_one_process_continues_to_the_same_trajectories_as
     assert before.items() <= hashes(out).items()
 
 
+@pytest.mark.slow
 def test_the_result_has_the_keys_that_other_tools_read(two_jobs: Path) -> None:
     result = json.loads(two_jobs.with_name("asked.json").read_text())
     assert {"episodes", "sr", "spl", "ne_m", "cr", "sr_ci95", "cr_ci95", "by_scene", "by_crowd", "by_robot"} <= set(
@@ -110,6 +111,7 @@ def test_the_log_of_an_episode_has_a_row_a_control_period(two_jobs: Path) -> Non
     assert log["columns"]["odom_x_m"][-1] != pytest.approx(log["columns"]["x_m"][-1] - 1.0, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_without_an_output_directory_the_result_is_only_printed(
     suite: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

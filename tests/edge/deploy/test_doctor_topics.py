@@ -120,6 +120,7 @@ def test_a_domain_that_cannot_be_joined_skips_the_topics(error: Exception) -> No
     assert check.level is Level.SKIP and str(error) in check.found
 
 
+@pytest.mark.slow
 def test_a_domain_is_surveyed_by_discovery_and_by_counting(dds_domain: int) -> None:
     """The doctor's participant is the first of this process; the base joins after it."""
     config = robot(dds_domain)

@@ -326,6 +326,7 @@ def test_records_of_the_chunk_the_disk_did_not_take_are_counted(
     assert recorder.dropped == {"/tick": 3, "/camera": 1}
 
 
+@pytest.mark.slow
 def test_records_the_disk_took_before_it_failed_are_not_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -154,6 +154,7 @@ def test_a_loop_of_links_is_no_file(vlm: Path) -> None:
     assert "config.json: no such file" in refusal(vlm)
 
 
+@pytest.mark.slow
 def test_a_header_of_a_million_tensors_of_one_name_is_refused_at_once(tmp_path: Path) -> None:
     names = [f'"{number}":0' for number in range(300_000)]
     path = tmp_path / "bad.safetensors"

@@ -155,6 +155,7 @@ def test_the_same_stages_have_no_error(model: TicVla, reference: StageOutputs, s
     assert (error.kv_cosine, error.token_agreement) == (1, 1)
 
 
+@pytest.mark.slow
 def test_a_prompt_in_one_call_gives_what_the_runtimes_chunks_give(
     model: TicVla, reference: StageOutputs, samples: SampleSet
 ) -> None:

@@ -46,6 +46,7 @@ def runs() -> dict[str, list[drift.DriftRun]]:
     return {level: [drift.replay(w, level, 10 + w.seed) for w in walks] for level in drift.TESTED}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", drift.TESTED)
 def test_the_fused_offset_errs_at_most_half_as_much_as_the_robots_own(
     runs: dict[str, list[drift.DriftRun]], level: str

@@ -56,6 +56,7 @@ def crowded() -> Iterator[Drive]:
     yield driven(people=6, seed=1, goal_xy=(12.0, 0.0), timeout_s=60.0, shortest_m=12.0)
 
 
+@pytest.mark.slow
 def test_it_goes_round_what_bars_the_way_without_touching_it(round_a_wall: Drive) -> None:
     assert round_a_wall.outcome.success and not round_a_wall.outcome.collided
     assert round_a_wall.outcome.spl > 0.9

@@ -107,6 +107,7 @@ def test_a_stop_ends_the_run_with_what_is_finished(tmp_path: Path) -> None:
     assert not finished and len(read_results(store.directory)) == 2 and backend.closed
 
 
+@pytest.mark.slow
 def test_a_killed_worker_process_is_reported_with_its_signal_and_its_last_lines(tmp_path: Path) -> None:
     store = store_in(tmp_path)
     run_all(tasks_in(store, "dies"), LocalJobs(1, FAKE_WORKER), store)
@@ -120,6 +121,7 @@ def test_a_worker_process_that_is_killed_once_is_run_again_and_leaves_no_log(tmp
     assert sorted(path.name for path in (store.directory / "episodes").iterdir()) == ["a.json", "dies-once.json"]
 
 
+@pytest.mark.slow
 def test_half_a_result_is_none(tmp_path: Path) -> None:
     store = store_in(tmp_path)
     run_all(tasks_in(store, "half"), LocalJobs(1, FAKE_WORKER), store)

@@ -246,6 +246,7 @@ def test_a_datagram_with_an_invalid_frame_is_refused(wrong: dict[str, object]) -
     assert unpacked(msgpack.packb({**table, **wrong})) is None
 
 
+@pytest.mark.slow
 def test_multicast_neither_receives_nor_sends_outside_the_machine() -> None:
     act = """
 frame = pack_message(can.Message(arbitration_id=0x321, data=b"out", is_extended_id=False))

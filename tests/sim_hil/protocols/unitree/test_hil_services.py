@@ -64,6 +64,7 @@ class TestLease:
 
 
 class TestParameters:
+    @pytest.mark.slow
     @given(st.text(max_size=100))
     def test_no_text_breaks_a_reader(self, text: str) -> None:
         assert parse_table(text) is None or isinstance(parse_table(text), dict)

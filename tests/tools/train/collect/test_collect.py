@@ -66,11 +66,13 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 # -- who makes what ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_every_requested_drive_is_collected_and_no_other(whole: Dataset) -> None:
     assert whole.ids == tuple(f"e{number:05d}" for number in range(COUNT))
     assert Counter(_begun(whole.folder)).most_common(1)[0][1] == 1
 
 
+@pytest.mark.slow
 def test_how_many_processes_there_are_changes_nothing(tmp_path: Path, whole: Dataset) -> None:
     assert _collect(tmp_path, jobs=1).sha256 == whole.sha256
 
@@ -83,6 +85,7 @@ def test_a_collection_that_was_ended_goes_on_to_the_same_data_set(tmp_path: Path
     assert _collect(tmp_path, jobs=2).sha256 == whole.sha256
 
 
+@pytest.mark.slow
 def test_only_the_drive_whose_file_is_damaged_is_made_again(tmp_path: Path, whole: Dataset) -> None:
     shutil.copytree(whole.folder, tmp_path, dirs_exist_ok=True)
     (tmp_path / BEGUN).unlink()
@@ -119,6 +122,7 @@ def test_a_process_that_ends_badly_after_its_last_drive_costs_nothing(tmp_path: 
     assert len(_collect(tmp_path, count=8)) == 8
 
 
+@pytest.mark.slow
 def test_a_process_that_never_begins_ends_the_collection_with_its_last_lines(tmp_path: Path, faulty: Faulty) -> None:
     faulty(deaf=True)
     with pytest.raises(StageFailedError, match=r"e00000 .* exit code 5: no hands"):
@@ -203,6 +207,7 @@ def test_a_real_drive_is_made_of_a_training_scenario_and_is_the_same_in_any_proc
     assert len(drive.traces) == (len(drive) - 1) // 10 + 1
 
 
+@pytest.mark.slow
 def test_the_stage_collects_by_the_recipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(collection.fill, "__kwdefaults__", {**collection.fill.__kwdefaults__, "command": FAKE})
     result = collect(_job(tmp_path))

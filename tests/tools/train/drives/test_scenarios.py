@@ -78,6 +78,7 @@ def test_the_demos_sentence_is_none_of_trainings() -> None:
     assert INSTRUCTION.lower() not in {text.lower().rstrip(".") for s in scenarios(CORRIDOR) for text in s.wordings}
 
 
+@pytest.mark.slow
 def test_a_scenario_with_a_wording_or_a_crowd_of_the_benchmark_is_refused() -> None:
     scenario = scenarios("office")[0]
     taken = (*scenario.wordings[:-1], SUITE[0].instructions[0])
