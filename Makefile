@@ -9,21 +9,26 @@ PEOPLE ?= 4
 DURATION ?= 60
 ROBOT ?= go2
 
-# Isolated tests: two at a time, one thread each, at low priority. Beside them run tests that start real-time processes,
-# one at a time: those mostly wait, and no test may depend on an idle machine.
+# Tests: two at a time with one thread each where they are isolated, one at a time where they start real-time processes.
 WORKERS ?= 2
 PYTEST := $(BIN)/python -m pytest
 PARALLEL := OMP_NUM_THREADS=1 $(PYTEST) -n $(WORKERS) --dist loadfile
 PROCESS_FILES = $(shell grep -rlF --include='test_*.py' mark.process tests)
 # Both kinds of test share a folder, so that the model is exported once. $(1): the tests' name, $(2): options, $(3): marker.
-tiers = @folder=$$(mktemp -d) && export EDGE_TEST_FOLDER="$$folder" && \
-	trap 'kill $$isolated 2>/dev/null; wait $$isolated; rm -rf "$$folder"' EXIT && \
-	{ nice -n 10 env $(PARALLEL) $(2) -m "$(3)not process" > "$$folder/isolated.log" 2>&1 & } && \
-	isolated=$$!; \
+tiers = @folder=$$(mktemp -d) && trap 'rm -rf "$$folder"' EXIT && export EDGE_TEST_FOLDER="$$folder" && \
+	echo "== $(1) tests, $(WORKERS) at a time" && \
+	$(PARALLEL) $(2) -m "$(3)not process" && \
 	echo "== $(1) tests of processes, one at a time" && \
-	{ $(PYTEST) $(2) -m "$(3)process and not repeated" $(PROCESS_FILES); processes=$$?; } ; \
+	$(PYTEST) $(2) -m "$(3)process and not repeated" $(PROCESS_FILES)
+# Both kinds beside each other, the isolated ones at the lowest priority: fast tests of processes mostly wait. Slow ones
+# drive robots in real time and need the processor.
+fast_tiers = @folder=$$(mktemp -d) && export EDGE_TEST_FOLDER="$$folder" && \
+	trap 'kill $$isolated 2>/dev/null; wait $$isolated; rm -rf "$$folder"' EXIT && \
+	{ nice -n 19 env $(PARALLEL) -m "not slow and not process" > "$$folder/isolated.log" 2>&1 & } && isolated=$$!; \
+	echo "== fast tests of processes, one at a time" && \
+	{ $(PYTEST) -m "not slow and process and not repeated" $(PROCESS_FILES); processes=$$?; } ; \
 	wait $$isolated; code=$$?; isolated=; \
-	echo "== $(1) tests, $(WORKERS) at a time" && cat "$$folder/isolated.log" && test $$processes = 0 && test $$code = 0
+	echo "== fast tests, $(WORKERS) at a time" && cat "$$folder/isolated.log" && test $$processes = 0 && test $$code = 0
 # Tests start hundreds of processes; without compiled modules on the disk each would compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
@@ -102,7 +107,7 @@ lint: .venv/.test-installed
 	$(BIN)/mypy
 
 test: lint
-	$(call tiers,fast,,not slow and )
+	$(fast_tiers)
 
 test-slow: .venv/.test-installed
 	$(call tiers,slow,--durations=15,slow and )
