@@ -109,7 +109,7 @@ def test_no_person_runs_into_a_robot_that_stands_in_the_middle_of_a_corridor(see
 
 @pytest.fixture
 def standing(hall: Scene) -> People:
-    """A person who stands at (15, 0), heading pi, for at least 13 s if the robot stays away."""
+    """A person at (15, 0) who faces back along x, and stands for at least 13 s while the robot stays away."""
     scene = replace(hall, places=(Place("spot", (15.0, 0.0), pi, "stand"),))
     for seed in range(40):
         twin = People(scene, 1, seed)
