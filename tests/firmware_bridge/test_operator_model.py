@@ -60,7 +60,7 @@ class Desk:
     @contextmanager
     def _in_place(self) -> Iterator[None]:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(operate_module, "BridgeClient", lambda _: _Client(self))
+            patch.setattr(operate_module, "BridgeClient", lambda _, first: _Client(self, first))
             patch.setattr(operate_module, "time", self)
             yield
 
@@ -112,9 +112,11 @@ class Desk:
 class _Client:
     """What `operate` uses of `BridgeClient`."""
 
-    def __init__(self, desk: Desk) -> None:
+    def __init__(self, desk: Desk, first: Message | None) -> None:
         self._desk = desk
         desk.connect()
+        if first is not None:
+            desk.send(first)
 
     def stop(self) -> None:
         self._desk.send(Stop())
