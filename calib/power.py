@@ -164,17 +164,24 @@ def _calibrate(
 
 
 def stage_ms(phases: Sequence[Phase]) -> dict[str, list[float]]:
-    """Time of one unit of each stage in ms, one value a round; a token's is a generation's beyond its prompt."""
+    """Time of one unit of each stage in ms, one value a round.
+
+    A token's is a generation's beyond its prompt, an action's a tick's beyond its semantic context, if it contains one.
+    """
     times: dict[str, list[float]] = {stage: [] for stage in STAGES}
-    prefill_s = 0.0
+    prefill_s = context_s = 0.0
     for phase in phases:
         if phase.name not in STAGES or not phase.counts.get(phase.name):
             continue
         seconds = phase.seconds
         if phase.name == "prefill":
             prefill_s = seconds / phase.counts["prefill"]
+        if phase.name == "semantic_context":
+            context_s = seconds / phase.counts["semantic_context"]
         if phase.name == "decode":
             seconds -= prefill_s * phase.counts.get("prefill", 0.0)
+        if phase.name == "action_expert":
+            seconds -= context_s * phase.counts.get("semantic_context", 0.0)
         if seconds > 0:
             times[phase.name].append(1e3 * seconds / phase.counts[phase.name])
     return times

@@ -21,7 +21,7 @@ from edge.power.governor.plan import STAGES
 from edge.power.meters.meter import MeterError, PowerMeter, PowerSample
 from edge.reasoning.prompt import EXAMPLE_BEFORE, EXAMPLE_PAST_PATH
 from edge.state.ring import EncodedFrame
-from edge.state.semantic import SemanticState
+from edge.state.semantic import STRAIGHT_AHEAD, SemanticState, waypoints_now
 
 INSTRUCTION: Final = "walk down the corridor and stop at the vending machine"
 READ_S: Final = 0.05
@@ -133,7 +133,7 @@ class Load:
         )
         self._kv = generation.last_layer_kv
         context = self._policy.semantic_context(self._kv)
-        self._semantic = SemanticState(0, 0, here, 0, self._kv, context, generation.text, None)
+        self._semantic = SemanticState(0, 0, here, 0, self._kv, context, generation.text, STRAIGHT_AHEAD)
         self.prompt_tokens, self.new_tokens = generation.prompt_tokens, generation.new_tokens
         self._act()
 
@@ -142,10 +142,10 @@ class Load:
         return {
             "idle": (_sleep_until, False),
             "vision_encoder": (self._repeat(self._encode), False),
+            "semantic_context": (self._repeat(self._context), False),  # before the phase that may contain it
             "action_expert": (self._repeat(self._act), False),
             "prefill": (self._repeat(lambda: self._generate(0)), False),
             "decode": (self._repeat(lambda: self._generate(self._runtime.max_new_tokens)), False),
-            "semantic_context": (self._repeat(self._context), False),
             "control": (self._control, True),
             "control and reasoning": (self._both, True),
         }
@@ -157,9 +157,14 @@ class Load:
     def _act(self) -> None:
         self._policy.act(self._tokens, (0.0, 0.0, 0.0), 1.0, self._here, self._semantic)
         self._counts.add("action_expert")
+        if self._policy.guided_by_waypoints:  # its context is a part of every tick
+            self._counts.add("semantic_context")
 
     def _context(self) -> None:
-        self._policy.semantic_context(self._kv)
+        if self._policy.guided_by_waypoints:
+            self._policy.make_context({"waypoints": waypoints_now(STRAIGHT_AHEAD, self._here)})
+        else:
+            self._policy.semantic_context(self._kv)
         self._counts.add("semantic_context")
 
     def _generate(self, tokens: int) -> None:
@@ -190,7 +195,8 @@ class Load:
             # To the end of a generation: the energy of a part would not be counted.
             while time.monotonic() < end_s:
                 self._generate(self._runtime.max_new_tokens)
-                self._context()
+                if not self._policy.guided_by_waypoints:
+                    self._context()
 
         thread = threading.Thread(target=reason, name="reasoning")
         thread.start()

@@ -20,14 +20,16 @@ from calib.power import add_arguments, measured_target, run, stage_ms, target_te
 from calib.power_fit import FitError, Phase, fit_energy, non_negative
 from calib.power_load import Counts, EnergyLog, Load
 from edge.artifacts.files import MANIFEST_NAME, ArtifactError, read_manifest, seal
-from edge.artifacts.manifest import Artifacts
+from edge.artifacts.manifest import Artifacts, load_artifacts
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_REFUSED
 from edge.power.governor.plan import STAGES, power_plan
 from edge.power.meters.meter import MeterError, PowerSample
 from export.model.config import PRESETS
+from export.model.network import build
 from export.plan.plan import plan
 from export.plan.timing import measured_point
 from export.targets.file import for_model, list_targets, load_target, parse_target, with_settings
+from tests.support.artifact_directory import write_artifacts
 
 TREES = Path(__file__).parents[1] / "data/sysfs"
 SECOND = 1_000_000_000
@@ -137,6 +139,30 @@ def test_a_meter_that_loses_readings_of_a_phase_is_an_error_and_not_a_small_ener
 
 def test_a_token_takes_what_a_generation_takes_beyond_its_prompt() -> None:
     assert stage_ms(phases(rounds=1))["decode"] == [pytest.approx(1e3 * (20 - 20 * 20 / 90) / 960)]
+
+
+def test_an_action_takes_what_a_tick_takes_beyond_its_context() -> None:
+    ran = [
+        Phase("semantic_context", 2.0, 1.0, {"semantic_context": 1000}),
+        Phase("action_expert", 2.0, 1.0, {"action_expert": 400, "semantic_context": 400}),
+    ]
+    assert stage_ms(ran)["action_expert"] == [pytest.approx(3.0)]
+
+
+@pytest.mark.slow
+def test_a_policy_guided_by_waypoints_makes_its_context_in_every_tick(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    action = dataclasses.replace(PRESETS["nano"].action, layers=2, semantic_interface="waypoints", motion_offset=False)
+    network = build(dataclasses.replace(PRESETS["nano"], action=action), 3)
+    monkeypatch.setattr("edge.inference.warm_up.check_answers", lambda *_: None)  # these artifacts have no answers
+    counts = Counts()
+    load = Load(load_artifacts(write_artifacts(network, tmp_path)), counts)
+    for name, ran in (("action_expert", (1, 1)), ("semantic_context", (0, 1))):
+        before = counts.copy()
+        load.phases()[name][0](0.0)
+        after = counts.copy()
+        assert tuple(after[stage] - before[stage] for stage in ("action_expert", "semantic_context")) == ran
 
 
 @pytest.mark.parametrize("name", list_targets())
