@@ -54,8 +54,9 @@ SCHEMAS: Mapping[str, Schema] = {
     ),
     "/tick": _record(
         "tic_vla.Tick",
-        ("delay_given_s", "offset_sd", "supervisor", "speed_scale", "active"),
+        ("missed", "delay_given_s", "offset_sd", "supervisor", "speed_scale", "active"),
         tick=_INT,
+        missed=_INT,  # ticks left out so far because an earlier one was late
         now_ns=_INT,
         start_ns=_INT,
         duration_ms=_NUMBER,
@@ -177,13 +178,19 @@ SCHEMAS: Mapping[str, Schema] = {
     ),
     "/truth": _record(
         "tic_vla.Truth",  # only where a simulator knows it
-        ("route_m", "route_bearing_rad", "clearance_m"),
+        ("people_seen", "route_m", "route_bearing_rad", "clearance_m"),
         pose=_VECTOR,  # x m, y m, θ rad in the world
         people=_ROWS,  # (x m, y m, heading rad) of those within 10 m
+        people_seen={"type": "array", "items": _BOOL},  # whether no solid hides each of them from the camera
         touching={"type": "array", "items": _TEXT},  # labels of what the robot touches
         route_m=_NUMBER_OR_NULL,  # length of the shortest path to the goal
         route_bearing_rad=_NUMBER_OR_NULL,  # direction of its point 3 m ahead, seen from the robot
         clearance_m=_NUMBER_OR_NULL,  # to the nearest object
+    ),
+    "/recorder": _record(
+        "tic_vla.Recorder",  # live only: state of the flight log
+        dropped=_INT,  # records that may be missing in it
+        error=_TEXT_OR_NULL,  # why nothing is written
     ),
     "/result": {"title": "tic_vla.Result", "type": "object"},
 }

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import ClassVar, Final
 
 from edge.flightlog.part import Payload, encode
+from edge.flightlog.recorder import Recorder
 from edge.live.options import LiveError, LiveOptions
 from edge.live.wire import (
     CONFIG,
@@ -45,7 +46,7 @@ from firmware_bridge.core.config import RobotConfig
 _MOST_EVENTS: Final = 256
 _PERIOD_S: Final = 0.05
 _DROPPED_PERIOD_S: Final = 1.0
-"""Time between two messages about dropped records, s."""
+"""Time between two messages about dropped records, of the view's or of the flight log's, s."""
 _START_S: Final = 10.0
 _LAST_S: Final = 0.3
 """Time for what waits while the process takes nothing when the feed closes, s."""
@@ -226,6 +227,8 @@ class LiveFeed(RecordFeed):
 
     _end_s: ClassVar[float] = 7.0
     """The same, s: the view answers the stops under way and ends by itself within 6 s."""
+    recorder: Recorder | None = None
+    """Writer of the run's flight log; the view shows once a second what it has lost."""
 
     def __init__(
         self, options: LiveOptions, bridge: Path | None, stop: Callable[[], bool], report: Callable[[str], None]
@@ -238,6 +241,7 @@ class LiveFeed(RecordFeed):
         """
         self.stopped = False
         """Whether the view has requested a stop."""
+        self._log_due_s = 0.0
         self._stop = stop
         token = options.token()
         config = ViewConfig(options.address, options.port, token, bridge)
@@ -246,6 +250,13 @@ class LiveFeed(RecordFeed):
         self.url = options.url(self.port, token)
         if (elsewhere := options.url_elsewhere(self.port, token)) is not None:
             report(f"live view for other computers: {elsewhere}")
+
+    def _send_dropped(self) -> None:
+        super()._send_dropped()
+        if self.recorder is not None and time.monotonic() >= self._log_due_s:
+            self._log_due_s = time.monotonic() + _DROPPED_PERIOD_S
+            found = {"dropped": sum(self.recorder.dropped.values()), "error": self.recorder.error}
+            self.put("/recorder", time.monotonic_ns(), found)
 
     @property
     def picture_fd(self) -> int:

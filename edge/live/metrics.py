@@ -42,7 +42,9 @@ class Metrics:
         self._tokens = Counter("tic_vla_generated_tokens", "Tokens of the reasoning text.", registry=self._registry)
         self._faults = Counter("tic_vla_faults", "Faults raised.", ("name", "action"), registry=self._registry)
         self._dropped = gauge("view_dropped_records", "Records that the view did not receive or could not read.")
+        self._unsaved = gauge("log_dropped_records", "Records that may be missing in the flight log.")
         self._ticks = gauge("ticks", "Number of ticks of the control thread.")
+        self._missed = gauge("missed_ticks", "Number of ticks left out because an earlier one was late.")
         self._delay = gauge("delay_seconds", "Delay from the anchor's frame to now.")
         self._frame_age = gauge("frame_age_seconds", "Age of the frame that the policy saw.")
         self._speed = gauge("speed_mps", "Forward speed.", "kind")
@@ -74,12 +76,15 @@ class Metrics:
                     _set(self._yaw.labels(kind), record[f"{kind}_wz_radps"])
             elif topic == "/battery":
                 _set(self._battery, record["soc_percent"])
+            elif topic == "/recorder":
+                self._unsaved.set(record["dropped"])
         except (KeyError, TypeError, ValueError, IndexError):
             return
 
     def _take_tick(self, record: Mapping[str, Any]) -> None:
         self._tick.observe((record["late_ms"] + record["duration_ms"]) / 1e3)
         self._ticks.set(record["tick"] + 1)
+        self._missed.set(record.get("missed", math.nan))
         self._active.set(len(record.get("active", ())))
         _set(self._delay, record["delay_s"])
         age_ms = record["frame_age_ms"]

@@ -260,6 +260,7 @@ class ControlLoop:
             used = None if delay_s is None else semantic
             record: dict[str, Any] = {
                 "tick": statistics.ticks - 1,
+                "missed": statistics.missed,
                 "now_ns": now_ns,
                 "start_ns": start_ns,
                 "duration_ms": (end_ns - start_ns) / 1e6,
@@ -275,7 +276,7 @@ class ControlLoop:
                 "offset": None if latency is None else latency.offset.as_tuple(),
                 "offset_sd": None if used is None else self._offset_sd(used.anchor_ns),
                 "pose": None if pose is None else pose.T_odom_base.as_tuple(),
-                "state": None if pose is None else (pose.vx_mps, pose.vy_mps, pose.wz_radps),
+                "state": None if pose is None else pose.velocity,
                 "trajectory": self._seconds(trajectory),
                 "target": None if command.target is None else command.target.as_tuple(),
                 "command": (command.vx_mps, command.vy_mps, command.wz_radps),
@@ -372,9 +373,8 @@ class ControlLoop:
     def _act(
         self, encoded: EncodedFrame, pose: StampedPose, latency: LatencyInput, semantic: SemanticState
     ) -> npt.NDArray[np.float32]:
-        state = (pose.vx_mps, pose.vy_mps, pose.wz_radps)
         try:
-            return self._policy.act(encoded.tokens, state, latency.delay_s, latency.offset, semantic)
+            return self._policy.act(encoded.tokens, pose.velocity, latency.delay_s, latency.offset, semantic)
         except GraphError:
             # The controller treats a trajectory that is not finite as bad output and stops.
             return np.full((1, 3), np.nan, dtype=np.float32)

@@ -170,6 +170,7 @@ class RunSession:
                 recorder = Recorder(self._options.record)
                 if recorder.error is not None:
                     raise RefusedError(recorder.error)
+            views.watch(recorder)
             records = RecordSinks.of(recorder, views.live, views.ros2)
             loops = self._loops = assemble(
                 self._engines, self._robot, self._options, inputs, sink, records, stop=self._stop,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from edge.flightlog.recorder import Recorder
 from edge.live.feed import LiveFeed, Ros2Feed
 from edge.live.options import LiveError, LiveOptions
 from edge.run.arming import RefusedError
@@ -33,6 +34,11 @@ class Views:
                 say(self.ros2.ready)
         except LiveError as error:
             raise RefusedError(str(error)) from error
+
+    def watch(self, recorder: Recorder | None) -> None:
+        """Let the live view tell whether the flight log is whole."""
+        if self.live is not None:
+            self.live.recorder = recorder
 
     def close(self) -> None:
         """End them; may be called twice."""

@@ -19,6 +19,11 @@ class StampedPose:
     roll_rad: float = 0.0
     pitch_rad: float = 0.0
 
+    @property
+    def velocity(self) -> tuple[float, float, float]:
+        """Body velocity: vx m/s, vy m/s, ωz rad/s."""
+        return (self.vx_mps, self.vy_mps, self.wz_radps)
+
 
 class PoseHistory:
     """The last `capacity` poses; one writer, any number of readers, none ever waits.

@@ -86,16 +86,24 @@ SAMPLES: dict[str, dict[str, Any]] = {
         "started_ns": 1,
         "tick_period_ms": 100,
     },
-    "/tick": {**synthetic_run.tick_records(4)[-1], "supervisor": "RUNNING", "speed_scale": 1.0, "active": []},
+    "/tick": {
+        **synthetic_run.tick_records(4)[-1],
+        "missed": 0,
+        "supervisor": "RUNNING",
+        "speed_scale": 1.0,
+        "active": [],
+    },
     "/semantic": synthetic_run.generations(12)[0],
     "/truth": {
         "pose": [1.0, 2.0, 0.1],
         "people": [[3.0, 2.0, 0.5]],
+        "people_seen": [True],
         "touching": ["person"],
         "route_m": 12.0,
         "route_bearing_rad": -0.2,
         "clearance_m": 0.8,
     },
+    "/recorder": {"dropped": 3, "error": None},
     "/result": synthetic_run.run_result(4),
 }
 

@@ -156,6 +156,14 @@ def test_the_metrics_are_those_of_the_newest_records() -> None:
     assert text.endswith("# EOF\n")
 
 
+def test_missed_ticks_and_records_lost_from_the_log_are_metrics() -> None:
+    metrics = Metrics()
+    metrics.take("/tick", tick(missed=2))
+    metrics.take("/recorder", {"dropped": 5, "error": None})
+    assert samples(metrics, "missed_ticks") == ["tic_vla_missed_ticks 2.0"]
+    assert samples(metrics, "log_dropped") == ["tic_vla_log_dropped_records 5.0"]
+
+
 def samples(metrics: Metrics, name: str) -> list[str]:
     """The lines of one metric."""
     return [line for line in metrics.text(0).decode().splitlines() if line.startswith(f"tic_vla_{name}")]

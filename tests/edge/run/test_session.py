@@ -247,6 +247,9 @@ class FakeViews:
     def open(self, *_: object) -> None:
         self._order.append("views")
 
+    def watch(self, *_: object) -> None:
+        pass
+
     def close(self) -> None:
         pass
 

@@ -17,11 +17,13 @@ HARNESS = """
 const page = require("fs").readFileSync(0, "utf8");
 const script = page.slice(page.indexOf(">", page.indexOf("<script")) + 1, page.indexOf("</script>"));
 let now = 1000;
-const timers = [], elements = {}, sockets = [], stops = [], found = [];
-const canvas = new Proxy({}, { get: () => () => {}, set: () => true });
+const timers = [], elements = {}, sockets = [], stops = [], found = [], drawn = [];
+const draw = name => (...all) => { if (name === "fillText") drawn.push(all[0]); };
+const canvas = new Proxy({}, { get: (_, name) => draw(name), set: () => true });
 const element = () => ({
   textContent: "", className: "", children: [], width: 10, height: 10, clientWidth: 10,
-  replaceChildren(...all) { this.children = all; }, append() {}, prepend(one) { this.children.unshift(one); },
+  replaceChildren(...all) { this.children = all; }, append(...all) { this.children.push(...all); },
+  prepend(one) { this.children.unshift(one); },
   getContext: () => canvas, get parentElement() { return this; },
 });
 class WebSocket {
@@ -49,9 +51,10 @@ async function advance(ms) {
 }
 const text = id => elements[id] ? elements[id].textContent : "";
 const run = stamp_ns => sockets.at(-1).say("/run", stamp_ns, { robot: "go2", instruction: "walk" });
-const tick = stamp_ns => sockets.at(-1).say("/tick", stamp_ns, {
+const tiles = () => elements.tiles.children.map(tile => tile.children.map(part => part.textContent).join(" "));
+const tick = (stamp_ns, also = {}) => sockets.at(-1).say("/tick", stamp_ns, {
   late_ms: 1, duration_ms: 9, delay_s: 1, frame_age_ms: 40, pose: [1, 2, 0], trajectory: [[1, 0, 0]],
-  command: [0.5, 0, 0], state: [0.4, 0, 0], active: [], reason: "", supervisor: "RUNNING",
+  command: [0.5, 0, 0], state: [0.4, 0, 0], active: [], reason: "", supervisor: "RUNNING", ...also,
 });
 require("vm").runInNewContext(script, {
   WebSocket, fetch, URLSearchParams, setTimeout: later, clearTimeout: never, requestAnimationFrame: act => act(),
@@ -228,3 +231,22 @@ def test_a_run_that_has_ended_says_so_until_the_next_one() -> None:
         found.push(text("link"));
     """
     assert watch(scenario) == ["the run has ended", "the run has ended, waiting for the next one"]
+
+
+def test_faults_are_drawn_over_time() -> None:
+    scenario = """
+        sockets[0].open(); tick(1e9); await advance(200); found.push(drawn.includes("faults"));
+        tick(1.1e9, { active: ["camera-frozen"] }); tick(1.2e9); await advance(200);
+        found.push(drawn.includes("faults"), drawn.includes("camera-frozen"));
+    """
+    assert watch(scenario) == [False, True, True]
+
+
+def test_missed_ticks_and_records_lost_from_the_log_are_shown() -> None:
+    scenario = """
+        sockets[0].open(); tick(1e9); sockets[0].say("/recorder", 1e9, { dropped: 0, error: null });
+        await advance(200); found.push(tiles().length);
+        tick(2e9, { missed: 2 }); sockets[0].say("/recorder", 2e9, { dropped: 7, error: "the disk is full" });
+        await advance(200); found.push(tiles().length, ...tiles().filter(text => /missed|lost/.test(text)));
+    """
+    assert watch(scenario) == [10, 11, "10.0 ms tick, 2 missed", "7 records lost from the log: the disk is full"]

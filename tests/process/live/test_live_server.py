@@ -15,6 +15,7 @@ import aiohttp
 import psutil
 import pytest
 
+from edge.flightlog.recorder import Recorder
 from edge.live.feed import LiveFeed
 from edge.live.options import LiveError, LiveOptions
 
@@ -295,3 +296,17 @@ def test_the_process_ends_with_the_runner(view: View) -> None:
 def test_nothing_listens_on_another_address_than_the_loopback(view: View) -> None:
     listening = [each for each in view.process.net_connections() if each.status == psutil.CONN_LISTEN]
     assert [each.laddr.ip for each in listening] == ["127.0.0.1"]
+
+
+def test_a_client_is_told_what_the_flight_log_has_lost(view: View, tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "missing" / "flight.mcap")
+    recorder.put("/tick", 1, {"tick": 1})
+    view.feed.recorder = recorder
+
+    async def watch(session: aiohttp.ClientSession) -> Any:
+        async with session.ws_connect(f"{view.base}/view?token={view.token}") as channel:
+            return json.loads((await channel.receive(5)).data)
+
+    message = view.run(watch)
+    assert message["topic"] == "/recorder" and message["record"]["dropped"] == 1
+    assert "No such file" in message["record"]["error"]
