@@ -125,7 +125,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--flight-logs", choices=FLIGHT_CHOICES, help="episodes of an artifact policy whose flight log is kept and "
         "explained in the report: all, failed (or collided), none; causes keeps the causes of failures alone (default: "
-        "failed with --out, causes for dynanav-fresh; lockstep only)",
+        "failed with --out, causes for dynanav-fresh)",
     )  # fmt: skip
     add_live_arguments(p)
     p.add_argument("--json", metavar="FILE|-", help="write the result as JSON")

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from edge.flightlog.explain.flight import read_flight
 from edge.live.options import LiveOptions
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError, PolicySpec
 from sim_hil.benchmark.conditions.latency import LatencyProfile
-from sim_hil.benchmark.env.metrics import FRAME_HZ
+from sim_hil.benchmark.env.metrics import FRAME_HZ, Outcome
 from sim_hil.benchmark.suite.episode import Episode, load_suite
 from sim_hil.benchmark.workers import realtime_episode as realtime
 from sim_hil.benchmark.workers.realtime_episode import check_realtime, drivable
@@ -20,6 +23,8 @@ from sim_hil.realtime.children import Child, Children, StepError
 from sim_hil.realtime.robots import ROBOTS
 from sim_hil.realtime.stack import Stack, StackOptions
 from sim_hil.realtime.truth import TruePose
+from tests.support.benchmark import dynanav_fakes as fakes
+from tests.support.runner import explained_flights as flights
 
 POLICY = PolicySpec("artifacts", "out/nano")
 GOOD = Conditions(POLICY, clock="realtime", mode="async", robot="go2")
@@ -137,6 +142,36 @@ def test_the_runner_of_an_episode_serves_the_live_view_of_the_benchmark(
         realtime.run_realtime(task, lambda _seconds: None)
     at = asked.index("--live")
     assert asked[at : at + 6] == live.arguments()
+
+
+class EndedStack:
+    """What a stack leaves: the runner's flight log of 12 s, and a trace with 30 poses a second."""
+
+    def __init__(self, folder: Path) -> None:
+        self._log, self.trace = folder / "flight.mcap", folder / "trace.jsonl"
+        flights.write(self._log)
+        lines: list[dict[str, Any]] = [{"t_ns": flights.at(0.0), "kind": "people", "poses": [[3.0, 0.0, 0.0]]}]
+        for step in range(360):
+            pose = {"x": step / 60, "y": 0.0, "theta": 0.0, "touching": ["plant"] if step == 90 else []}
+            lines.append({"t_ns": flights.at(step / 30), "kind": "pose", **pose})
+        self.trace.write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+    def flight_log(self, _number: int) -> Path:
+        return self._log
+
+
+def test_an_episode_is_explained_from_the_runners_records_and_the_truth(tmp_path: Path) -> None:
+    here = replace(fakes.episode("a"), scene="corridor", goal_xy=(13.0, 0.6))
+    task = EpisodeTask(here, GOOD, tmp_path)
+    poses = [TruePose(flights.at(second), 0.0, 0.0, 0.0, ()) for second in (1.0, 10.0)]
+    flight = realtime.episode_flight(EndedStack(tmp_path), task, poses)  # type: ignore[arg-type]
+    outcome = Outcome("a", False, "timeout", 7.0, 0.0, False, (), None, False, 1.0, 12.0, 60.0, "0" * 64)
+    flight.settle("failed", outcome, tmp_path)
+    found = read_flight(task.flight_path)
+    assert found.last_tick_ns == flights.at(10.0) and len(found.frames_ns) == 101
+    assert (found.truths[0].stamp_ns, len(found.truths)) == (flights.at(1.0), 91)
+    assert found.truths[0].people == ((3.0, 0.0),) and any(truth.touching == ("plant",) for truth in found.truths)
+    assert found.result["end"] == "timeout"
 
 
 def test_a_speed_limit_that_is_none_is_refused(tmp_path: Path) -> None:

@@ -24,13 +24,13 @@ def generation_of(flight: Flight, tick: RecordedTick) -> RecordedGeneration | No
 def people_ahead(truth: Truth, within_m: float) -> list[tuple[float, float]]:
     """Return distance, m, and direction, rad, of the people in the camera's field of view, the nearest first.
 
-    The truth has no walls, so a wall or another person may hide each of them from the camera.
+    Those whom a solid hides are left out where the truth says so; otherwise each may be hidden.
     """
     seen = []
-    for x_m, y_m in truth.people:
+    for (x_m, y_m), is_free in zip(truth.people, truth.seen or (True,) * len(truth.people), strict=True):
         there = truth.T_world_base.inverse() @ SE2(x_m, y_m, 0.0)
         distance_m, direction_rad = math.hypot(there.x_m, there.y_m), bearing_rad((there.x_m, there.y_m))
-        if distance_m <= within_m and abs(direction_rad) <= VIEW_RAD:
+        if is_free and distance_m <= within_m and abs(direction_rad) <= VIEW_RAD:
             seen.append((distance_m, direction_rad))
     return sorted(seen)
 

@@ -126,7 +126,8 @@ def _scene(flight: Flight, at_ns: int) -> str:
         return ""
     people = people_ahead(truth, 6.0)
     count = "1 person" if len(people) == 1 else f"{len(people)} people"
-    nearest = f", possibly hidden, the nearest at {people[0][0]:.1f} m" if people else ""
+    hidden = ", possibly hidden" if truth.seen is None else ""
+    nearest = f"{hidden}, the nearest at {people[0][0]:.1f} m" if people else ""
     route = flight.route_at(at_ns)
     way = ""
     if route is not None and route.route_bearing_rad is not None:

@@ -37,17 +37,24 @@ class Truth:
     """Length of the shortest path to the goal."""
     route_bearing_rad: float | None = None
     """Direction of that path 3 m ahead, seen from the robot, left positive."""
+    seen: tuple[bool, ...] | None = None
+    """Whether no solid hides each of `people` from the camera; None where that is unknown."""
 
     @staticmethod
     def of_record(stamp_ns: int, record: Mapping[str, Any]) -> Truth:
         """Read a `/truth` record. Raises LookupError, TypeError, ValueError or OverflowError."""
+        people = tuple((float(row[0]), float(row[1])) for row in record["people"])
+        seen = None if record.get("people_seen") is None else tuple(bool(each) for each in record["people_seen"])
+        if seen is not None and len(seen) != len(people):
+            raise ValueError(f"people_seen: expected {len(people)} values, found {len(seen)}")
         return Truth(
             stamp_ns,
             SE2(*(float(value) for value in record["pose"])),
-            tuple((float(row[0]), float(row[1])) for row in record["people"]),
+            people,
             tuple(str(label) for label in record["touching"]),
             _number_or_none(record.get("route_m")),
             _number_or_none(record.get("route_bearing_rad")),
+            seen,
         )
 
 

@@ -153,7 +153,8 @@ def _person(flight: Flight, event: Event, ticks: Sequence[RecordedTick]) -> Verd
     if ahead and not claimed:
         count = "1 person" if len(ahead) == 1 else f"{len(ahead)} people"
         numbers = f"{count} within {NEAR_M:g} m ahead, the nearest {ahead[0][0]:.1f} m away"
-        because = f"the text names no person, and one was within {NEAR_M:g} m ahead, possibly hidden"
+        hidden = ", possibly hidden" if truth.seen is None else ""
+        because = f"the text names no person, and one was within {NEAR_M:g} m ahead{hidden}"
         return Verdict(REASONING, because, (numbers, _line(generation.text, "Motion")))
     if not ahead:
         numbers = f"nobody within {NEAR_M:g} m ahead {age_s:.1f} s before the contact"
@@ -201,16 +202,19 @@ def _wrong_way(generation: RecordedGeneration, waypoint_rad: float, route_rad: f
 
     `waypoint_rad`, `route_rad`: directions of both, seen from the robot at the anchor, left positive.
     """
-    plan = parse_text(generation.text).plan
+    plan, turns = parse_text(generation.text).plan, abs(route_rad) >= _STRAIGHT_RAD
     if plan is None:
         return "the waypoints lead off the path to the goal, and the text states no plan"
     if isinstance(plan.action, Stop):
-        return "the text ends the route too early: it plans to stop, and the path still turns"
+        onward = "still turns" if turns else "goes on"
+        return f"the text ends the route too early: it plans to stop, and the path {onward}"
     if isinstance(plan.action, TurnBack):
         return "the text turns back, and the path goes on"
     if plan.action.side not in (LEFT, RIGHT):
+        if not turns:
+            return "the text goes straight on, as the path does, and its waypoints lead off it"
         return "the text goes straight on, and the path turns"
-    if abs(route_rad) < _STRAIGHT_RAD:
+    if not turns:
         return "the text turns where the path goes straight on: too early, or into a wrong opening"
     side = 1 if plan.action.side == LEFT else -1
     if side * route_rad < 0:

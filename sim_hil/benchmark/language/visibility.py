@@ -1,4 +1,7 @@
-"""Size of a landmark in the robot's image, by ray casting; fast enough to check every landmark of a suite."""
+"""What the robot's camera can see: size of a landmark in its image, and people, by ray casting.
+
+Fast enough to check every landmark of a suite.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +20,7 @@ HFOV_RAD = radians(100.0)
 ASPECT = 16 / 9
 EYE_M = 0.36  # height of the robot's camera
 _SAMPLES = 6  # rays along each side of a face
+_PERSON_M = (0.3, 1.0, 1.6)  # heights at which a person is looked for
 
 
 class Sightlines:
@@ -60,6 +64,14 @@ class Sightlines:
     def most_pixels(self, path: Iterable[tuple[float, float, float]], thing: SceneObject, range_m: float) -> float:
         """Return the largest area of an object in the images along poses (x m, y m, heading rad), px."""
         return max((self.pixels((x, y, EYE_M), heading, thing, range_m) for x, y, heading in path), default=0.0)
+
+    def persons(self, eye: tuple[float, float, float], people: Array) -> NDArray[np.bool_]:
+        """Return for each person [n, 2 or more] (x m, y m) whether the line to a part of the body is free."""
+        points = np.array([(row[0], row[1], height_m) for row in people for height_m in _PERSON_M]).reshape(-1, 3)
+        if not len(points):
+            return np.zeros(0, bool)
+        blocked = _blocked(np.array(eye), points, self._boxes)
+        return np.asarray(~blocked.reshape(-1, len(_PERSON_M)).all(axis=1))
 
 
 def _faces(thing: SceneObject, eye: tuple[float, float, float]) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""Flight log of an episode in virtual time: the runner's records, the policy's pictures and the simulator's truth.
+"""Flight log of an episode: the runner's records, the policy's pictures and the simulator's truth.
 
 `edge-replay explain` and `edge-replay video` read it like a robot's log. Everything stays in memory until `keep`, so
 that an episode that nobody asks about costs no disk.
@@ -7,21 +7,22 @@ that an episode that nobody asks about costs no disk.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from math import atan2, hypot, pi
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edge.core.geometry import SE2
 from edge.flightlog.part import LogPart, PartFile, Payload
 from sim_hil.benchmark.env.metrics import Outcome
+from sim_hil.benchmark.language.visibility import EYE_M, Sightlines
+from sim_hil.benchmark.suite.episode import Episode
 from sim_hil.benchmark.suite.robots import robot_grid
 from sim_hil.scene.nav_grid import NavGrid, length_m
-
-if TYPE_CHECKING:
-    from sim_hil.benchmark.env.world import EpisodeWorld
+from sim_hil.scene.scene import Scene
 
 _PEOPLE_M: Final = 10.0
 """Distance within which people are recorded, m."""
@@ -36,8 +37,8 @@ Vec2 = tuple[float, float]
 class EpisodeFlight:
     """Records of one episode; `keep` writes them, otherwise they are lost. It is the recorder of the policy's loop."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path, scene: Scene, episode: Episode) -> None:
+        self._path, self._scene, self._episode = path, scene, episode
         self._records: list[tuple[str, int, Payload]] = []
         self._truths: list[tuple[int, dict[str, Any]]] = []
 
@@ -45,10 +46,11 @@ class EpisodeFlight:
         """Add a record of the policy, as `Recorder.put`."""
         self._records.append((topic, stamp_ns, payload))
 
-    def see(self, world: EpisodeWorld, stamp_ns: int) -> None:
-        """Add the true state of the world at an instant of the records' clock, ns."""
-        pose = world.pose()
-        people = world.people()
+    def see(self, stamp_ns: int, pose: SE2, people: NDArray[np.float64], touching: Iterable[str]) -> None:
+        """Add the true state of the world at an instant of the records' clock.
+
+        `people`: (x m, y m, heading rad) [n, 3]; `touching`: labels of what the robot touches.
+        """
         near = people[np.hypot(people[:, 0] - pose.x_m, people[:, 1] - pose.y_m) < _PEOPLE_M] if len(people) else people
         self._truths.append(
             (
@@ -56,12 +58,25 @@ class EpisodeFlight:
                 {
                     "pose": pose.as_tuple(),
                     "people": [[round(float(value), 3) for value in row] for row in near],
-                    "touching": sorted(world.touching),
+                    "touching": sorted(touching),
                 },
             )
         )
 
-    def keep(self, world: EpisodeWorld, outcome: Outcome) -> None:
+    def settle(self, choice: str, outcome: Outcome, folder: Path) -> None:
+        """Keep the log, its cause alone below the run's `folder`, or nothing: `choice` is --flight-logs.
+
+        Raises OSError.
+        """
+        if choice == "none" or (choice != "all" and outcome.success and not outcome.collided):
+            return
+        self.keep(outcome)
+        if choice == "causes":
+            from sim_hil.benchmark.results.causes import keep_cause  # here: most episodes need no explanation
+
+            keep_cause(self._path, folder)
+
+    def keep(self, outcome: Outcome) -> None:
         """Write the log, whole or not at all. Raises OSError."""
         self._path.parent.mkdir(parents=True, exist_ok=True)
         partial = self._path.with_suffix(".partial")
@@ -70,10 +85,12 @@ class EpisodeFlight:
             end_ns = self._truths[-1][0] if self._truths else 0
             run = [record for record in self._records if record[0] == "/run"]
             rest = [record for record in self._records if record[0] != "/run"]
-            grid, goal = robot_grid(world.scene, world.episode.robot), world.episode.goal_xy
+            grid, sightlines = robot_grid(self._scene, self._episode.robot), Sightlines(self._scene)
             for number, (at_ns, truth) in enumerate(self._truths):
-                route = {} if number % _ROUTE_EVERY else _route(grid, truth["pose"], goal)
-                rest.append(("/truth", at_ns, {**truth, **route}))
+                x_m, y_m, _ = truth["pose"]
+                seen = {"people_seen": sightlines.persons((x_m, y_m, EYE_M), truth["people"]).tolist()}
+                route = {} if number % _ROUTE_EVERY else _route(grid, truth["pose"], self._episode.goal_xy)
+                rest.append(("/truth", at_ns, {**truth, **seen, **route}))
             for record in (*run, *sorted(rest, key=lambda record: record[1])):
                 part.add(*record)
             part.add("/result", end_ns, outcome_record(outcome))

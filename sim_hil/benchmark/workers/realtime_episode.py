@@ -21,21 +21,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.core.geometry import SE2
-from edge.flightlog.reader import RecordingError, read_messages
+from edge.flightlog.reader import RecordingError, jpeg_bytes, read_messages
+from edge.flightlog.schemas import SCHEMAS
 from firmware_bridge.system.input_file import read_json
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.conditions.variants import artifact_directory
 from sim_hil.benchmark.env.metrics import FRAME_HZ, is_success, measure
+from sim_hil.benchmark.results.flight import EpisodeFlight
 from sim_hil.benchmark.results.record import EpisodeLog, EpisodeResult
 from sim_hil.benchmark.suite.episode import Episode
 from sim_hil.benchmark.workers.task import EpisodeTask, episode_result
 from sim_hil.realtime.robots import GO2, ROBOTS, StackRobot, free_domain
 from sim_hil.realtime.stack import Stack, StackOptions
 from sim_hil.realtime.truth import TruePose, TruthTail, read_lines
+from sim_hil.scene.scene import load_scene
 
 ARM_TIMEOUT_S: Final = 90.0
 POLL_S: Final = 0.05
 FOLDER: Final = "realtime"
+_TRUTH_NS: Final = 100_000_000
+"""Time between two truths in the flight log, ns: one a tick, as in lockstep."""
 
 OnTime = Callable[[float], None]
 
@@ -117,6 +122,8 @@ def run_realtime(task: EpisodeTask, on_time: OnTime) -> EpisodeResult:
     )
     log, generations = _log(stack, drive.poses)
     log.write(task.log_path, generations, _last_people(stack.trace), episode.goal_xy)
+    if task.flights != "none":
+        episode_flight(stack, task, drive.poses).settle(task.flights, outcome, task.folder)
     stopped_by = next(iter(_json(stack.result("edge-run-1")).get("faults", [])), "") if drive.end == "stopped" else ""
     return episode_result(
         task, outcome, log, generations=len(generations), stopped_by=str(stopped_by), started_ns=started_ns
@@ -206,6 +213,28 @@ def _log(stack: Stack, poses: Sequence[TruePose]) -> tuple[EpisodeLog, list[Mapp
     except (OSError, RecordingError):
         pass  # the runner ended before its first record; keep the rows read so far
     return log, generations
+
+
+def episode_flight(stack: Stack, task: EpisodeTask, poses: Sequence[TruePose]) -> EpisodeFlight:
+    """Read the flight log of the episode from the runner's and from the trace of the robot's side."""
+    flight = EpisodeFlight(task.flight_path, load_scene(task.episode.scene), task.episode)
+    begin_ns, end_ns = poses[0].t_ns, poses[-1].t_ns
+    try:
+        for topic, stamp_ns, record in read_messages(stack.flight_log(1)):
+            ours = topic in SCHEMAS and topic not in ("/truth", "/result")
+            if not ours or (topic != "/run" and stamp_ns > end_ns):
+                continue
+            flight.put(topic, stamp_ns, jpeg_bytes(record) if topic == "/camera" else record)
+    except (OSError, RecordingError, ValueError):
+        pass  # the runner ended before its first record, or the log is damaged; keep what was read
+    people, due_ns = np.empty((0, 3)), begin_ns
+    for line in read_lines(stack.trace):
+        if line.get("kind") == "people":
+            people = np.array(line["poses"], float).reshape(-1, 3)
+        elif line.get("kind") == "pose" and due_ns <= line["t_ns"] <= end_ns:
+            due_ns = line["t_ns"] + _TRUTH_NS
+            flight.see(line["t_ns"], SE2(line["x"], line["y"], line["theta"]), people, line["touching"])
+    return flight
 
 
 def _generation(record: Mapping[str, Any], begin_ns: int) -> dict[str, Any]:

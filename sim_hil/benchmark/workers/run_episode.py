@@ -48,13 +48,14 @@ def drive(
             cleanup.callback(video.discard)
         flight = None
         if task.flights != "none" and isinstance(policy, ArtifactsPolicy):
-            policy.recorder = flight = EpisodeFlight(task.flight_path)
+            policy.recorder = flight = EpisodeFlight(task.flight_path, world.scene, episode)
         policy.reset(episode, task.instruction, world if policy.privileged else None, episode.seed)
         while not world.done:
             observation = world.observe()
             command = policy.act(observation)
             if flight is not None:
-                flight.see(world, START_NS + round(observation.time_s * 1e9))
+                stamp_ns = START_NS + round(observation.time_s * 1e9)
+                flight.see(stamp_ns, world.pose(), world.people(), world.touching)
             notes = policy.notes()
             delay_s = notes.get("delay_s")
             log.add(
@@ -73,10 +74,8 @@ def drive(
         log.write(task.log_path, generations or [], world.people(), episode.goal_xy)
         if video is not None and (task.video == "all" or not outcome.success or outcome.collided):
             video.keep()
-        if flight is not None and (task.flights == "all" or not outcome.success or outcome.collided):
-            flight.keep(world, outcome)
-            if task.flights == "causes":
-                _keep_cause(task)
+        if flight is not None:
+            flight.settle(task.flights, outcome, task.folder)
         count = None if generations is None else len(generations)
         return episode_result(
             task, outcome, log, generations=count, stopped_by=str(notes.get("stopped_by", "")), started_ns=started_ns
@@ -87,12 +86,6 @@ def _video(task: EpisodeTask) -> EpisodeVideo:
     from sim_hil.benchmark.results.video import EpisodeVideo  # here: fonts and drawing are only needed for this
 
     return EpisodeVideo(task.video_path, task.episode, task.instruction)
-
-
-def _keep_cause(task: EpisodeTask) -> None:
-    from sim_hil.benchmark.results.causes import keep_cause  # here: most episodes need no explanation
-
-    keep_cause(task.flight_path, task.folder)
 
 
 def _realtime(task: EpisodeTask, on_time: OnTime) -> EpisodeResult:

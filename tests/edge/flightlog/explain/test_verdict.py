@@ -97,7 +97,7 @@ def test_a_contact_with_a_person_asks_whether_the_picture_showed_one(
 
 
 def test_a_person_whom_a_wall_may_hide_is_not_said_to_be_in_the_picture() -> None:
-    """The truth has places of people, and no walls."""
+    """An older truth has places of people, and no walls."""
     person = (SPEED_MPS * 9.0 + 2.0, 0.3)
     flight = flights.flight(truths=touched("person", people=(person,)))  # type: ignore[arg-type]
     (found,) = explain(flight)
@@ -105,6 +105,15 @@ def test_a_person_whom_a_wall_may_hide_is_not_said_to_be_in_the_picture() -> Non
     assert found.verdict.evidence[0] == "1 person within 3 m ahead, the nearest 2.0 m away"
     saw = dict(found.steps)["The camera saw"]
     assert "in truth 1 person within 6 m ahead, possibly hidden, the nearest at 2.0 m" in saw
+
+
+@pytest.mark.parametrize(("seen", "cause"), [(True, REASONING), (False, LATE)])
+def test_a_text_need_not_name_a_person_whom_a_solid_hides(seen: bool, cause: str) -> None:
+    person = (SPEED_MPS * 9.0 + 2.0, 0.3)
+    flight = flights.flight(truths=touched("person", people=(person,), seen=(seen,)))  # type: ignore[arg-type]
+    assert only(flight, COLLISION).cause == cause
+    (found,) = explain(flight)
+    assert "hidden" not in found.verdict.because + dict(found.steps)["The camera saw"]
 
 
 def test_a_contact_with_a_person_whom_the_text_named_is_the_action_experts_whatever_the_route() -> None:
@@ -124,7 +133,10 @@ def test_a_person_who_walks_into_a_standing_robot_is_the_cause() -> None:
 @pytest.mark.parametrize(
     ("plan", "waypoints", "route_rad", "because"),
     [
-        ("stop in 9 m", STRAIGHT, 1.3, "ends the route too early"),
+        ("stop in 9 m", STRAIGHT, 1.3, "plans to stop, and the path still turns"),
+        ("stop in 9 m", TURN_LEFT, 0.0, "plans to stop, and the path goes on"),
+        ("go straight to the room in 9 m", STRAIGHT, 1.3, "goes straight on, and the path turns"),
+        ("go straight to the room in 9 m", TURN_LEFT, 0.0, "its waypoints lead off it"),
         ("turn left into the room in 9 m", STRAIGHT, 1.3, "turns too late"),
         ("turn right into the room in 9 m", STRAIGHT, 1.3, "wrong side"),
         ("turn left into the room in 1 m", TURN_LEFT, 0.0, "wrong opening"),

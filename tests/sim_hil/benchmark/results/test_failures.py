@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -63,33 +62,46 @@ def test_a_damaged_log_leaves_its_episode_out(run: Path, tmp_path: Path) -> None
     assert failures(tmp_path, [fakes.missed("a")]) == [] and failure_sheet([]) is None
 
 
-class World:
-    """The start of an episode's world, as far as a flight log reads it."""
+MISSED = Outcome("a", False, "timeout", 12.0, 0.0, False, (), None, False, 1.0, 12.0, 60.0, "0" * 64)
+REACHED = replace(MISSED, success=True, end="reached")
 
-    def __init__(self) -> None:
-        self.episode = replace(fakes.episode("a"), scene="corridor", goal_xy=(13.0, 0.6))
-        self.scene = load_scene("corridor")
-        self.touching: frozenset[str] = frozenset()
 
-    def pose(self) -> SE2:
-        return SE2(1.0, 0.0, 0.0)
-
-    def people(self) -> np.ndarray[Any, Any]:
-        return np.array([[3.0, 0.0, 0.0], [90.0, 0.0, 0.0]])
+def flight_of(folder: Path) -> EpisodeFlight:
+    """One tick of an episode in the corridor, with a person in view, one behind a wall, and one far away."""
+    episode = replace(fakes.episode("a"), scene="corridor", goal_xy=(13.0, 0.6))
+    flight = EpisodeFlight(folder / "flights" / "a.mcap", load_scene("corridor"), episode)
+    flight.put("/run", flights.START_NS, SAMPLES["/run"])
+    flight.put("/tick", flights.START_NS, {**SAMPLES["/tick"], "now_ns": flights.START_NS})
+    people = np.array([[3.0, 0.0, 0.0], [3.0, 5.0, 0.0], [90.0, 0.0, 0.0]])
+    flight.see(flights.START_NS, SE2(1.0, 0.0, 0.0), people, ())
+    return flight
 
 
 def test_an_episodes_log_has_the_truth_with_the_path_to_the_goal(tmp_path: Path) -> None:
-    world = World()
-    flight = EpisodeFlight(tmp_path / "flights" / "a.mcap")
-    flight.put("/run", flights.START_NS, SAMPLES["/run"])
-    flight.put("/tick", flights.START_NS, {**SAMPLES["/tick"], "now_ns": flights.START_NS})
-    flight.see(world, flights.START_NS)  # type: ignore[arg-type]
-    outcome = Outcome("a", False, "timeout", 12.0, 0.0, False, (), None, False, 1.0, 12.0, 60.0, "0" * 64)
-    flight.keep(world, outcome)  # type: ignore[arg-type]
+    flight_of(tmp_path).keep(MISSED)
     (truth,) = read_flight(tmp_path / "flights" / "a.mcap").truths
-    assert truth.people == ((3.0, 0.0),), "those within 10 m"
+    assert truth.people == ((3.0, 0.0), (3.0, 5.0)), "those within 10 m"
+    assert truth.seen == (True, False), "the second stands behind the corridor's wall"
     assert truth.route_m == pytest.approx(12.0, abs=0.5) and abs(truth.route_bearing_rad or 9.0) < 0.3
     assert [path.name for path in (tmp_path / "flights").iterdir()] == ["a.mcap"]
+
+
+@pytest.mark.parametrize(
+    ("choice", "outcome", "kept"),
+    [
+        ("all", REACHED, ["flights/a.mcap"]),
+        ("failed", REACHED, []),
+        ("failed", replace(REACHED, collided=True), ["flights/a.mcap"]),
+        ("failed", MISSED, ["flights/a.mcap"]),
+        ("causes", MISSED, ["causes/a.json"]),
+        ("none", MISSED, []),
+    ],
+)
+def test_what_is_kept_of_an_episode_is_what_was_asked_for(
+    tmp_path: Path, choice: str, outcome: Outcome, kept: list[str]
+) -> None:
+    flight_of(tmp_path).settle(choice, outcome, tmp_path)
+    assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()] == kept
 
 
 def test_of_a_failure_its_cause_alone_can_be_kept(run: Path, tmp_path: Path) -> None:
