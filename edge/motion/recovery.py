@@ -1,7 +1,8 @@
 """Recoveries: commands that replace the plan's when it makes no progress (ours).
 
-* Back off: the robot is commanded forward and does not move. It drives back along its own trail, the only space behind
-  it that is proved free. The plan cannot do so: it does not sense contact, and its arc never reverses.
+* Back off: the robot is commanded forward and does not move, or was just stopped because its pose stayed. It drives
+  back along its own trail, the only space behind it that is proved free. The plan cannot do so: it does not sense
+  contact, and its arc never reverses.
 * Turn at a standstill: the plan has stood for long although the text's waypoints lead on. The robot turns on the spot
   towards them, so that the next picture differs.
 * Stand at the goal: once past the goal the robot no longer sees it, and the text becomes unreliable. Texts that see the
@@ -33,6 +34,8 @@ ARRIVED: Final = "arrived"
 """Reason of a command: the plan's own, or a recovery's."""
 MOVING: Final = frozenset((BACKING_OFF, TURNING))
 """Reasons of the recoveries that move the robot."""
+HELD: Final = frozenset(("odometry-frozen", "robot-blocked"))
+"""Reasons of a stop after which the robot backs off: its pose stayed although it was commanded to move."""
 
 MAX_STEP_S: Final = 0.2
 """Largest duration counted for one late tick, s."""
@@ -112,6 +115,7 @@ class BackOff:
         self._retreat: _Retreat | None = None
         self._stuck_at: SE2 | None = None
         self._tries = self._failures = 0
+        self._held_at: SE2 | None = None  # by a stop of HELD, after which no command has driven forward yet
         self._last_ns: int | None = None
 
     def step(
@@ -123,6 +127,7 @@ class BackOff:
         scale = min(speed_scale, 1.0) if speed_scale > 0 else 0.0
         speed_mps = min(self._config.speed_mps, -self._config.vx_min_mps) * scale
         if T_odom_base is None or command.reason != OK or speed_mps <= 0:
+            self._held_at = T_odom_base if command.reason in HELD else self._held_at
             self._end(T_odom_base)
             return command
         if self._retreat is None:
@@ -147,6 +152,10 @@ class BackOff:
             self._stuck_at, self._tries, self._failures = None, 0, 0
         if command.vx_mps <= 0.0:
             return False
+        held_at, self._held_at = self._held_at, None
+        if held_at is not None and distance_m(held_at, pose) < _FAILED_M:
+            self._commanded = None
+            return self._failures < config.failures
         commanded = self._commanded = self._commanded or _Commanded(pose)
         commanded.for_s += elapsed_s
         commanded.distance_m += command.vx_mps * elapsed_s

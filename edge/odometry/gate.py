@@ -27,6 +27,10 @@ FROZEN_COMMAND_MPS = 0.2
 FROZEN_NS = 500_000_000
 FROZEN_M = 0.01
 FROZEN_RAD = 0.02
+FREED_M = 0.05
+AGAIN_NS = 10_000_000_000
+"""A robot whose pose has moved by more than the first since it last stayed, at most the second ago, is blocked: its
+odometry works."""
 MISMATCH_MPS = 0.5
 MISMATCH_RADPS = 0.5
 MISMATCH_WINDOW_NS = 200_000_000
@@ -124,6 +128,9 @@ class OdometryGate:
         self._apart_sums = [0.0, 0.0, 0.0, 0.0]
         self._pushed_since_ns: int | None = None
         self._pushed_from = (0.0, 0.0, 0.0)
+        self._held_ns: int | None = None
+        self._held_at = (0.0, 0.0, 0.0)
+        self._freed = False
         self._clock: _RobotClock | None = None
         self.rejected = 0
 
@@ -234,11 +241,12 @@ class OdometryGate:
 
         A robot at zero shows no fault: the next command is the next attempt, and the table counts them.
         """
+        x, y, theta = report.T_odom_base
+        self._freed = self._freed or math.hypot(x - self._held_at[0], y - self._held_at[1]) > FREED_M
         command = report.commanded
         if command is None or math.hypot(command[0], command[1]) <= FROZEN_COMMAND_MPS:
             self._pushed_since_ns = None
             return ()
-        x, y, theta = report.T_odom_base
         px, py, ptheta = self._pushed_from
         moved = math.hypot(x - px, y - py) > FROZEN_M or abs(wrap_angle(theta - ptheta)) > FROZEN_RAD
         if self._pushed_since_ns is None or moved:
@@ -248,9 +256,10 @@ class OdometryGate:
         if held_ns < FROZEN_NS:
             return ()
         self._pushed_since_ns = report.received_ns
-        return (
-            Finding("odometry-frozen", f"no motion for {held_ns / 1e9:.1f} s at {math.hypot(*command[:2]):.2f} m/s"),
-        )
+        again = self._held_ns is not None and report.received_ns - self._held_ns <= AGAIN_NS
+        name = "robot-blocked" if again and self._freed else "odometry-frozen"
+        self._held_ns, self._held_at, self._freed = report.received_ns, report.T_odom_base, False
+        return (Finding(name, f"no motion for {held_ns / 1e9:.1f} s at {math.hypot(*command[:2]):.2f} m/s"),)
 
     def _lag_ns(self, report: OdometryInputs) -> int:
         """Return this report's delay against the quickest report so far, by the robot's own clock."""

@@ -38,7 +38,9 @@ STUCK_LIVES: Final = 3
 """Number of consecutive runners that end within STUCK_M of each other for the robot to count as stuck."""
 STUCK_M: Final = 0.5
 CONTACT: Final = "contact"
-CONTACT_STOPS: Final = frozenset(("odometry-stays-frozen", "odometry-speed-mismatch", "tipped-over"))
+CONTACT_STOPS: Final = frozenset(
+    ("odometry-stays-frozen", "robot-stays-blocked", "odometry-speed-mismatch", "tipped-over")
+)
 """Faults that stop a robot after a contact."""
 SAMPLES, EVENTS, LEG = "samples.jsonl", "events.jsonl", "leg.json"
 

@@ -94,6 +94,19 @@ INPUTS: tuple[Fault, ...] = (
         _ROBOT + "a_pose_that_stays_for_good_is_tried_twice_and_then_stops_the_run",
     ),
     Fault(
+        "robot-blocked", 9, Action.ZERO, 700, _HERE,
+        "The robot does not move as commanded, and its pose has changed since the last time: something blocks it.",
+        "It drives back along its own path and tries again; the fifth time within 60 s stops the run.",
+        _ROBOT + "a_robot_that_is_blocked_again_and_again_is_stopped_the_fifth_time",
+        escalation=Escalation("robot-stays-blocked", 5, 60_000),
+    ),
+    Fault(
+        "robot-stays-blocked", 9, Action.STOP, 700, _HERE,
+        "The robot was blocked five times within 60 s.",
+        "Free the robot before arming again.",
+        _ROBOT + "a_robot_that_is_blocked_again_and_again_is_stopped_the_fifth_time",
+    ),
+    Fault(
         "odometry-not-finite", 10, Action.ZERO, 60, _HERE,
         "The robot reports a pose or velocity that is not finite or not possible.",
         "If it persists, restart the robot.",

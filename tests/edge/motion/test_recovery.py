@@ -173,6 +173,42 @@ def test_stuck_again_at_one_place_it_goes_further_back_and_elsewhere_as_at_first
     assert run.backed_m()[before] == pytest.approx(0.3, abs=0.05)
 
 
+def held(moves: Moves, reason: str = "odometry-frozen") -> Run:
+    """A robot that has driven 1 m and was then stopped for a second because its pose stayed."""
+    run = Run(BackOff(BACK), moves)
+    run.go(25)
+    run.go(10, replace(STANDS, reason=reason))
+    return run
+
+
+@pytest.mark.parametrize("reason", ["odometry-frozen", "robot-blocked"])
+def test_after_a_stop_because_its_pose_stayed_it_goes_back_first(reason: str) -> None:
+    run = held(wall_at(1.0), reason)
+    assert run.go(1).reason == BACKING_OFF
+    run.go(40)
+    assert run.backed_m()[0] == pytest.approx(0.3, abs=0.03)
+
+
+def test_after_another_stop_it_drives_on() -> None:
+    assert held(glide, "camera-stale").go(1).reason == "ok"
+
+
+def test_a_robot_that_has_moved_away_since_such_a_stop_drives_on() -> None:
+    run = held(glide)
+    run.pose = run.pose @ SE2(0.2, 0.0, 0.0)
+    assert run.go(1).reason == "ok"
+
+
+def test_stopped_so_again_and_again_it_gives_up_after_three_drives_back() -> None:
+    run = held(glide)
+    run.moves = jammed
+    for _ in range(5):
+        run.go(15)
+        run.go(10, replace(STANDS, reason="odometry-frozen"))
+    began = [k for k, reason in enumerate(run.reasons) if reason == BACKING_OFF != run.reasons[k - 1]]
+    assert len(began) == 3 and run.reasons.count(BACKING_OFF) <= 3 * 11
+
+
 @given(st.floats(0.01, 1.0), st.floats(-0.8, -0.01), st.floats(0.01, 1.0))
 def test_a_drive_back_never_leaves_the_robot_files_limits(
     wz_max_radps: float, vx_min_mps: float, speed_scale: float

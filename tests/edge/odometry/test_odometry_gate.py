@@ -85,6 +85,22 @@ def test_a_constant_pose_under_a_walk_command_is_frozen_after_half_a_second() ->
     assert first * 0.02 == pytest.approx(0.5, abs=0.021)
 
 
+@pytest.mark.parametrize(
+    ("moved_m", "pause_s", "name"),
+    [(0.3, 2.0, "robot-blocked"), (0.0, 2.0, "odometry-frozen"), (0.3, 12.0, "odometry-frozen")],
+    ids=["moved meanwhile", "stayed", "long ago"],
+)
+def test_a_pose_that_stays_again_is_frozen_or_blocked_by_whether_it_moved_meanwhile(
+    moved_m: float, pause_s: float, name: str
+) -> None:
+    pushes, pause = (0.3, 0.0, 0.0), round(pause_s / 0.02)
+    reports = [report(i, commanded=pushes) for i in range(30)]
+    reports += [report(30 + i, x=-moved_m * i / pause, commanded=(0.0, 0.0, 0.0)) for i in range(pause)]
+    reports += [report(30 + pause + i, x=-moved_m, commanded=pushes) for i in range(30)]
+    found = [name for verdict in feed(reports) for name in names(verdict)]
+    assert found == ["odometry-frozen", name]
+
+
 @pytest.mark.parametrize("command", [(0.15, 0.0, 0.0), (0.0, 0.0, 0.8), None])
 def test_a_pose_that_stays_without_a_command_to_walk_is_not_frozen(command: tuple[float, float, float] | None) -> None:
     assert all(not v.findings for v in feed([report(i, commanded=command) for i in range(100)]))

@@ -70,6 +70,7 @@ class Rig:
         self.pose = (3.0, 1.0, 0.0)
         self.spin_radps = 0.0
         self.blocked = False
+        self.wall_m = math.inf
         self.ticks = 0
         self.bench.see()
         self.bench.think()
@@ -81,7 +82,9 @@ class Rig:
 
     def report(self) -> None:
         """The robot has walked as commanded for 20 ms, and says so."""
-        vx = 0.0 if self.blocked else self.command[0]
+        vx = self.command[0]
+        if self.blocked or (vx > 0.0 and self.pose[0] >= self.wall_m):
+            vx = 0.0
         x, y, theta = self.pose
         self.pose = (x + 0.02 * vx, y, theta + 0.02 * self.spin_radps)
         now_ns = self.bench.now_ns
@@ -181,7 +184,17 @@ def test_a_pose_that_stays_for_good_is_tried_twice_and_then_stops_the_run(rig: R
     rig.blocked = True
     rig.drive(20)
     assert "odometry-stays-frozen" in rig.active and rig.bench.loop.supervision.stop
-    assert rig.moving_s(began_ns) <= 1.4  # 0.7 s each
+    assert rig.moving_s(began_ns) <= 2.5  # 0.7 s each, and 1 s back in between
+
+
+@pytest.mark.slow
+def test_a_robot_that_is_blocked_again_and_again_is_stopped_the_fifth_time(rig: Rig) -> None:
+    """It gets away from the obstacle and drives into it again."""
+    rig.wall_m = rig.pose[0]
+    rig.drive(60)
+    assert "robot-stays-blocked" in rig.active and rig.bench.loop.supervision.stop
+    assert rig.bench.loop.statistics.faults["odometry-frozen"] == 1
+    assert rig.bench.loop.statistics.faults["robot-blocked"] == 5
 
 
 @pytest.mark.parametrize("field", ["vx_mps", "gyro_wz_radps", "T_odom_base"])

@@ -34,6 +34,8 @@ NOT_INJECTED: Mapping[str, str] = MappingProxyType(
         "output-out-of-range": "only a message to the operator; five in a second are injected",
         "reasoning-failed": "only a message to the operator; five in a minute are injected",
         "odometry-stays-frozen": "its cause, one frozen pose, is injected; test of two on a fake clock",
+        "robot-blocked": "two frozen poses with motion in between; one is injected, test of both on a fake clock",
+        "robot-stays-blocked": "five blocks; test on a fake clock",
         "output-unsteady": "a milder oscillation; the hard one is injected",
         "semantic-old": "precedes an expired semantic state, which is injected",
         "reasoning-hung": "the robot already stands, because its semantic state has expired, which is injected",
