@@ -83,7 +83,8 @@ INPUTS: tuple[Fault, ...] = (
     Fault(
         "odometry-frozen", 9, Action.ZERO, 700, _HERE,
         "The robot is commanded to move and its pose does not change.",
-        "Check that the robot stands free and that its state is not frozen; a second time within 10 s stops the run.",
+        "Check that the robot stands free and that its state is not frozen; it drives back along its own path first, "
+        "and a second time within 10 s without any motion stops the run.",
         _ROBOT + "a_pose_that_stays_while_the_robot_is_told_to_walk_stops_it_for_a_second",
         escalation=Escalation("odometry-stays-frozen", 2, 10_000),
     ),
