@@ -31,10 +31,10 @@ from sim_hil.benchmark.results.flight import EpisodeFlight
 from sim_hil.benchmark.results.record import EpisodeLog, EpisodeResult
 from sim_hil.benchmark.suite.episode import Episode
 from sim_hil.benchmark.workers.task import EpisodeTask, episode_result
+from sim_hil.layouts.scenes import open_scene
 from sim_hil.realtime.robots import GO2, ROBOTS, StackRobot, free_domain
 from sim_hil.realtime.stack import Stack, StackOptions
 from sim_hil.realtime.truth import TruePose, TruthTail, read_lines
-from sim_hil.scene.scene import load_scene
 
 ARM_TIMEOUT_S: Final = 90.0
 POLL_S: Final = 0.05
@@ -217,7 +217,7 @@ def _log(stack: Stack, poses: Sequence[TruePose]) -> tuple[EpisodeLog, list[Mapp
 
 def episode_flight(stack: Stack, task: EpisodeTask, poses: Sequence[TruePose]) -> EpisodeFlight:
     """Read the flight log of the episode from the runner's and from the trace of the robot's side."""
-    flight = EpisodeFlight(task.flight_path, load_scene(task.episode.scene), task.episode)
+    flight = EpisodeFlight(task.flight_path, open_scene(task.episode.scene), task.episode)
     begin_ns, end_ns = poses[0].t_ns, poses[-1].t_ns
     try:
         for topic, stamp_ns, record in read_messages(stack.flight_log(1)):
