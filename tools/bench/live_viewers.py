@@ -11,6 +11,7 @@ import contextlib
 import functools
 import json
 import os
+import signal
 import socket
 import sys
 from collections.abc import Callable, Coroutine, Mapping
@@ -115,6 +116,8 @@ def main(argv: list[str] | None = None) -> int:
     """Watch until SIGINT; returns 0."""
     url, viewers = sys.argv[1:] if argv is None else argv
     os.nice(_NICENESS)
+    # A shell's background job, and what it starts, ignores SIGINT.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with contextlib.suppress(KeyboardInterrupt):
         asyncio.run(watch(url, viewers, functools.partial(print, flush=True)))
     return 0

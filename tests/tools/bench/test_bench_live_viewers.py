@@ -5,6 +5,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import signal
+import subprocess
+import sys
 from typing import Any
 
 from aiohttp import web
@@ -54,3 +57,16 @@ def test_a_refused_viewer_has_received_nothing_and_says_why() -> None:
     found = first_line(admits=False)
     assert found["received"] == {"page 1": 0}
     assert found["failure"].startswith("page 1: 403")
+
+
+def test_sigint_ends_the_viewers_of_a_benchmark_in_the_background() -> None:
+    command = [sys.executable, "-m", "tools.bench.live_viewers", "http://127.0.0.1:9/?token=t", "one viewer"]
+    # What a shell starts in the background ignores SIGINT.
+    viewers = subprocess.Popen(["sh", "-c", 'trap "" INT; exec "$@"', "sh", *command], stdout=subprocess.PIPE)
+    try:
+        assert viewers.stdout is not None and viewers.stdout.readline(), "its first line"
+        viewers.send_signal(signal.SIGINT)
+        assert viewers.wait(10) == 0
+    finally:
+        viewers.kill()
+        viewers.communicate()
