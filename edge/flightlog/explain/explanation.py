@@ -106,7 +106,8 @@ def _steps(flight: Flight, ticks: Sequence[RecordedTick]) -> tuple[tuple[str, st
         saw, claimed, waypoints = "no picture was used yet", nothing, nothing
     else:
         anchor_ns = generation.frames_ns[-1]
-        saw = f"picture of {flight.seconds(anchor_ns):.1f} s, {tick.delay_s:.1f} s old{_scene(flight, anchor_ns)}"
+        age = f"{tick.delay_s:.1f} s old at {flight.seconds(tick.now_ns):.1f} s"
+        saw = f"picture of {flight.seconds(anchor_ns):.1f} s, {age}{_scene(flight, anchor_ns)}"
         claimed = " ".join(generation.text.splitlines()[:-1]) or "nothing"
         points = parse_waypoints(generation.text)
         waypoints = "none" if points is None else " ".join(f"({x:.1f}, {y:.1f})" for x, y in points)
