@@ -188,6 +188,10 @@ class Rig:
                     memory.append({"s": round(into_s, 2), **{name: value / 2**20 for name, value in rss.items()}})
             used = [_cpu_s([process]) - before[0], _cpu_s(views) - before[1]]
             return Block(condition, begin_ns, time.monotonic_ns(), *used)
+        except psutil.NoSuchProcess as error:
+            time.sleep(SETTLE_S)  # a runner ends its view first
+            code = child.process.poll()
+            raise child.failure("its view ended" if code is None else f"ended early, exit code {code}") from error
         finally:
             if viewers is not None:
                 self._children.stop(viewers)
