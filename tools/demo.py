@@ -50,7 +50,7 @@ MODEL = "nano"
 UNTRAINED_SPEED_MPS = 0.14
 """Distance limit for untrained weights, 8 m in a minute: they reach the corridor's wall after 9 m.
 
-A robot that pushes against a wall is stopped until the next arming (`odometry-stays-frozen`).
+A robot that stays at a wall is stopped until the next arming (`odometry-stays-frozen`, `robot-stays-blocked`).
 """
 
 EXPORT_TIMEOUT_S = 1800.0

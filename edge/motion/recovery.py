@@ -44,6 +44,7 @@ _TRAIL_POSES: Final = 60
 _STILL_M, _STILL_RAD = 0.03, 0.1  # less motion than this counts as none
 _LOOK_BACK_M: Final = 0.15  # distance of the trail's pose whose heading is taken up
 _FAILED_M: Final = 0.1  # backing off by less than this counts as failed
+_HELD_NS: Final = 10_000_000_000  # longest time after a stop of HELD: later a pose that stays is a first time again
 _TURN_FIRST_RAD: Final = 0.6  # above this the robot turns before it drives back
 _REACH_S: Final = 0.5  # time in which the heading is corrected, within the limits
 
@@ -115,7 +116,7 @@ class BackOff:
         self._retreat: _Retreat | None = None
         self._stuck_at: SE2 | None = None
         self._tries = self._failures = 0
-        self._held_at: SE2 | None = None  # by a stop of HELD, after which no command has driven forward yet
+        self._held: tuple[SE2, int] | None = None  # by a stop of HELD, after which no command has driven forward yet
         self._last_ns: int | None = None
 
     def step(
@@ -127,13 +128,14 @@ class BackOff:
         scale = min(speed_scale, 1.0) if speed_scale > 0 else 0.0
         speed_mps = min(self._config.speed_mps, -self._config.vx_min_mps) * scale
         if T_odom_base is None or command.reason != OK or speed_mps <= 0:
-            self._held_at = T_odom_base if command.reason in HELD else self._held_at
+            if command.reason in HELD and T_odom_base is not None:
+                self._held = T_odom_base, now_ns
             self._end(T_odom_base)
             return command
         if self._retreat is None:
             if not self._trail or _gap(self._trail[-1], T_odom_base, _TRAIL_M, _TRAIL_RAD) >= 1.0:
                 self._trail.append(T_odom_base)
-            if not self._is_stuck(command, T_odom_base, elapsed_s):
+            if not self._is_stuck(command, T_odom_base, now_ns, elapsed_s):
                 return command
             self._tries += 1
             times = min(self._tries, self._config.further)
@@ -146,14 +148,14 @@ class BackOff:
             return command
         return back
 
-    def _is_stuck(self, command: VelocityCommand, pose: SE2, elapsed_s: float) -> bool:
+    def _is_stuck(self, command: VelocityCommand, pose: SE2, now_ns: int, elapsed_s: float) -> bool:
         config = self._config
         if self._stuck_at is not None and distance_m(self._stuck_at, pose) > config.apart_m:
             self._stuck_at, self._tries, self._failures = None, 0, 0
         if command.vx_mps <= 0.0:
             return False
-        held_at, self._held_at = self._held_at, None
-        if held_at is not None and distance_m(held_at, pose) < _FAILED_M:
+        held, self._held = self._held, None
+        if held is not None and now_ns - held[1] <= _HELD_NS and _gap(held[0], pose, _FAILED_M, _STILL_RAD) < 1.0:
             self._commanded = None
             return self._failures < config.failures
         commanded = self._commanded = self._commanded or _Commanded(pose)

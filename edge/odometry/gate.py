@@ -29,8 +29,9 @@ FROZEN_M = 0.01
 FROZEN_RAD = 0.02
 FREED_M = 0.05
 AGAIN_NS = 10_000_000_000
-"""A robot whose pose has moved by more than the first since it last stayed, at most the second ago, is blocked: its
-odometry works."""
+BLOCKED_NS = 15_000_000_000
+"""A pose that stays again: after less motion than the first, within the second, it stays frozen; after more motion,
+within the third, the robot is blocked, and its odometry works. A slow robot takes 13 s to back off and return."""
 MISMATCH_MPS = 0.5
 MISMATCH_RADPS = 0.5
 MISMATCH_WINDOW_NS = 200_000_000
@@ -191,6 +192,8 @@ class OdometryGate:
             turn_rad=turn + gap_s * report.wz_radps if mean_rate is None else mean_rate * (dt_s + gap_s),
         )
         self._last, self._suspect = report, None
+        if bridged is not None and not self._freed:
+            self._held_at = report.T_odom_base  # a jump frees nothing
         frozen = self._frozen(report)
         return Verdict(increment, (*findings, *mismatch, *frozen))
 
@@ -256,8 +259,11 @@ class OdometryGate:
         if held_ns < FROZEN_NS:
             return ()
         self._pushed_since_ns = report.received_ns
-        again = self._held_ns is not None and report.received_ns - self._held_ns <= AGAIN_NS
-        name = "robot-blocked" if again and self._freed else "odometry-frozen"
+        name = "odometry-frozen"
+        if self._held_ns is not None:
+            since_ns = report.received_ns - self._held_ns
+            if since_ns <= (BLOCKED_NS if self._freed else AGAIN_NS):
+                name = "robot-blocked" if self._freed else "odometry-stays-frozen"
         self._held_ns, self._held_at, self._freed = report.received_ns, report.T_odom_base, False
         return (Finding(name, f"no motion for {held_ns / 1e9:.1f} s at {math.hypot(*command[:2]):.2f} m/s"),)
 

@@ -83,10 +83,9 @@ INPUTS: tuple[Fault, ...] = (
     Fault(
         "odometry-frozen", 9, Action.ZERO, 700, _HERE,
         "The robot is commanded to move and its pose does not change.",
-        "Check that the robot stands free and that its state is not frozen; it drives back along its own path first, "
-        "and a second time within 10 s without any motion stops the run.",
+        "Check that the robot stands free and that its state is not frozen; unless recoveries are off, it drives back "
+        "along its own path first. Staying again within 10 s without 5 cm of motion stops the run.",
         _ROBOT + "a_pose_that_stays_while_the_robot_is_told_to_walk_stops_it_for_a_second",
-        escalation=Escalation("odometry-stays-frozen", 2, 10_000),
     ),
     Fault(
         "odometry-stays-frozen", 9, Action.STOP, 700, _HERE,
@@ -97,7 +96,8 @@ INPUTS: tuple[Fault, ...] = (
     Fault(
         "robot-blocked", 9, Action.ZERO, 700, _HERE,
         "The robot does not move as commanded, and its pose has changed since the last time: something blocks it.",
-        "It drives back along its own path and tries again; the fifth time within 60 s stops the run.",
+        "Unless recoveries are off, it drives back along its own path and tries again; the fifth time within 60 s "
+        "stops the run.",
         _ROBOT + "a_robot_that_is_blocked_again_and_again_is_stopped_the_fifth_time",
         escalation=Escalation("robot-stays-blocked", 5, 60_000),
     ),

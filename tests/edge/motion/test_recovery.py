@@ -199,6 +199,18 @@ def test_a_robot_that_has_moved_away_since_such_a_stop_drives_on() -> None:
     assert run.go(1).reason == "ok"
 
 
+def test_a_robot_that_has_turned_away_since_such_a_stop_drives_on() -> None:
+    run = held(glide)
+    run.pose = run.pose @ SE2(0.0, 0.0, 1.2)
+    assert run.go(1).reason == "ok"
+
+
+def test_such_a_stop_long_ago_is_forgotten() -> None:
+    run = held(glide)
+    run.go(101, replace(STANDS, reason="arrived"))
+    assert run.go(1).reason == "ok"
+
+
 def test_stopped_so_again_and_again_it_gives_up_after_three_drives_back() -> None:
     run = held(glide)
     run.moves = jammed

@@ -87,8 +87,14 @@ def test_a_constant_pose_under_a_walk_command_is_frozen_after_half_a_second() ->
 
 @pytest.mark.parametrize(
     ("moved_m", "pause_s", "name"),
-    [(0.3, 2.0, "robot-blocked"), (0.0, 2.0, "odometry-frozen"), (0.3, 12.0, "odometry-frozen")],
-    ids=["moved meanwhile", "stayed", "long ago"],
+    [
+        (0.3, 2.0, "robot-blocked"),
+        (0.3, 13.0, "robot-blocked"),
+        (0.3, 16.0, "odometry-frozen"),
+        (0.0, 2.0, "odometry-stays-frozen"),
+        (0.0, 12.0, "odometry-frozen"),
+    ],
+    ids=["moved", "moved slowly", "moved long ago", "stayed", "stayed long ago"],
 )
 def test_a_pose_that_stays_again_is_frozen_or_blocked_by_whether_it_moved_meanwhile(
     moved_m: float, pause_s: float, name: str
@@ -99,6 +105,13 @@ def test_a_pose_that_stays_again_is_frozen_or_blocked_by_whether_it_moved_meanwh
     reports += [report(30 + pause + i, x=-moved_m, commanded=pushes) for i in range(30)]
     found = [name for verdict in feed(reports) for name in names(verdict)]
     assert found == ["odometry-frozen", name]
+
+
+def test_a_jump_between_two_poses_that_stay_frees_no_robot() -> None:
+    pushes = (0.3, 0.0, 0.0)
+    reports = [report(i, x=0.0 if i < 40 else 1.0, commanded=pushes) for i in range(90)]
+    found = [name for verdict in feed(reports) for name in names(verdict)]
+    assert found == ["odometry-frozen", "odometry-jump", "odometry-stays-frozen"]
 
 
 @pytest.mark.parametrize("command", [(0.15, 0.0, 0.0), (0.0, 0.0, 0.8), None])
