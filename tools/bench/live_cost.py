@@ -45,6 +45,8 @@ CONDITIONS: Final = (NONE, ALONE, ONE, FIVE)
 SETTLE_S: Final = 3.0
 """Time ignored at the beginning of every block, s, in which viewers connect."""
 START_S: Final = 90.0
+OPEN: Final = ("--scene", "sidewalk", "--start", "28.7,20,0")
+"""Start with 5 m of free floor around it: in half an hour the circle drifts by 1.5 m, into the corridor's wall."""
 DRIVE: Final = "--drive"
 """First argument that selects the runner's process."""
 PERIOD_MS: Final = 100.0
@@ -150,7 +152,7 @@ class Rig:
 
     def __init__(self, children: Children, folder: Path, artifacts: Path) -> None:
         self._children, self._folder = children, folder
-        self._link = start_robot(children, folder, GO2)
+        self._link = start_robot(children, folder, GO2, OPEN)
         self._artifacts = artifacts
         self._drives = itertools.count(1)
 
