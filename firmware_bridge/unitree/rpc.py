@@ -12,6 +12,8 @@ from firmware_bridge.unitree.requests import MAX_BINARY_BYTES, Requester, Respon
 __all__ = ["MAX_BINARY_BYTES", "Response", "RpcClient", "RpcError", "make_request", "move_parameter"]
 
 _MATCH_POLL_S: Final = 0.01
+_AGAIN_NS: Final = 2_000_000_000
+"""Time without an answer after which a request is sent again: the robot may not have discovered our reader."""
 _NS: Final = 1_000_000_000
 
 
@@ -36,19 +38,27 @@ class RpcClient(Requester):
         return has_reader(self._writer) and has_writer(self._reader)
 
     def call(self, api_id: int, parameter: str = "", *, timeout_s: float) -> Response:
-        """Send and wait for the answer. Raises RpcError: no service, no answer in time, or the robot's error code."""
+        """Send, every 2 s, and wait for the answer.
+
+        Raises RpcError: no service, no answer in time, or the robot's error code.
+        """
         deadline_ns = time.monotonic_ns() + int(timeout_s * _NS)
         while not self.connected():
             if time.monotonic_ns() >= deadline_ns:
                 raise RpcError(f"{self.service}: no such service on the bus within {timeout_s:g} s; is the robot on?")
             time.sleep(_MATCH_POLL_S)
-        request_id = self.send(api_id, parameter)
-        if request_id is None:
-            raise RpcError(f"{self.service}: DDS did not accept request {api_id}")
-        while (left_ns := deadline_ns - time.monotonic_ns()) > 0:
-            self._waitset.wait(left_ns)
+        sent: set[int] = set()
+        again_ns = 0
+        while (now_ns := time.monotonic_ns()) < deadline_ns:
+            if now_ns >= again_ns:
+                request_id = self.send(api_id, parameter)
+                if request_id is None:
+                    raise RpcError(f"{self.service}: DDS did not accept request {api_id}")
+                sent.add(request_id)
+                again_ns = now_ns + _AGAIN_NS
+            self._waitset.wait(min(deadline_ns, again_ns) - now_ns)
             for response in self.responses():
-                if response.request_id != request_id or response.api_id != api_id:
+                if response.request_id not in sent or response.api_id != api_id:
                     continue
                 if response.code != 0:
                     raise RpcError(f"{self.service}: request {api_id} answered error {response.code}", response.code)

@@ -94,6 +94,14 @@ def test_a_call_returns_the_services_answer_or_raises_with_its_error_code(bus: B
     assert error.value.code == 4202
 
 
+def test_a_request_whose_answer_was_lost_is_sent_again(reader: Go2Reader, peer: Peer) -> None:
+    peer.answer = None
+    timer = threading.Timer(1.0, lambda: setattr(peer, "answer", (ids.OK, JPEG)))
+    timer.start()
+    assert reader.request_frame(5.0) == JPEG
+    assert peer.served == 2
+
+
 def test_a_missing_service_is_reported_in_time(bus: Bus) -> None:
     with pytest.raises(RpcError, match=r"no such service on the bus within 0\.1 s") as error:
         RpcClient(bus, "telepathy").call(1001, timeout_s=0.1)
