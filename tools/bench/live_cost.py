@@ -46,7 +46,7 @@ SETTLE_S: Final = 3.0
 """Time ignored at the beginning of every block, s, in which viewers connect."""
 START_S: Final = 90.0
 OPEN: Final = ("--scene", "sidewalk", "--start", "28.7,20,0")
-"""Start with 5 m of free floor around it: in half an hour the circle drifts by 1.5 m, into the corridor's wall."""
+"""Start with 5 m of free floor around it: in 13 minutes the circle had drifted by 0.8 m, to the corridor's wall."""
 DRIVE: Final = "--drive"
 """First argument that selects the runner's process."""
 PERIOD_MS: Final = 100.0
