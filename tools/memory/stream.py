@@ -6,7 +6,8 @@ Of the viewers two are pages, one is Foxglove with every channel, one reads noth
 no model runs. A reading is written to readings.jsonl every 10 s, so that an end by force loses nothing; SIGINT and
 SIGTERM end the stream and print what there is. The second half counts: growth of the private memory of the view, and
 of the process that feeds it, of at most 1 MB/h. It shows nothing if a page or Foxglove has received nothing, or if the
-view lacks more than 1 % of the messages.
+view lacks more than 1 % of the messages. --speed streams faster than real time: hours and growth per hour are then
+those of the log, and growth that comes with time and not with messages shows less.
 """
 
 from __future__ import annotations
@@ -73,10 +74,13 @@ def read_recording(log: Path) -> Recording:
 
 
 class Stream:
-    """Feeds a recording to a view and takes readings; `folder` receives them and the viewers' log."""
+    """Feeds a recording to a view and takes readings; `folder` receives them and the viewers' log.
 
-    def __init__(self, recording: Recording, folder: Path) -> None:
-        self._recording, self._folder = recording, folder
+    `speed`: seconds of the recording streamed in a second.
+    """
+
+    def __init__(self, recording: Recording, folder: Path, speed: float = 1.0) -> None:
+        self._recording, self._folder, self._speed = recording, folder, speed
         self._end = threading.Event()
         self._sent = 0
         self.file = folder / "readings.jsonl"
@@ -86,7 +90,7 @@ class Stream:
         self._end.set()
 
     def run(self, hours: float) -> None:
-        """Stream for so many hours or until `stop`. Raises LiveError or StepError."""
+        """Stream so many hours of the recording or until `stop`. Raises LiveError or StepError."""
         feed = LiveFeed(LiveOptions(port=0), None, lambda: False, print)
         try:
             with Children(self._folder) as children, self.file.open("w", encoding="ascii") as file:
@@ -97,7 +101,7 @@ class Stream:
                     raise LiveError("the live view has ended")
                 sending = threading.Thread(target=self._send, args=(feed,), name="stream", daemon=True)
                 sending.start()
-                end_s = time.monotonic() + 3600 * hours
+                end_s = time.monotonic() + 3600 * hours / self._speed
                 while time.monotonic() < end_s and not self._end.wait(PERIOD_S):
                     if not viewers.running:
                         raise viewers.failure("the viewers have ended")
@@ -116,11 +120,11 @@ class Stream:
         begin_s = time.monotonic()
         while not self._end.is_set():
             for into_s, topic, payload in self._recording.messages:
-                if self._end.wait(max(0.0, begin_s + into_s - time.monotonic())):
+                if self._end.wait(max(0.0, begin_s + into_s / self._speed - time.monotonic())):
                     return
                 feed.put(topic, time.monotonic_ns(), payload)
                 self._sent += 1
-            begin_s += self._recording.seconds
+            begin_s += self._recording.seconds / self._speed
 
 
 def newest_report(log: Path) -> dict[str, Any]:
@@ -133,25 +137,27 @@ def newest_report(log: Path) -> dict[str, Any]:
     return {}
 
 
-def judge(readings: Sequence[dict[str, Any]], hours: float) -> dict[str, Any]:
+def judge(readings: Sequence[dict[str, Any]], hours: float, speed: float = 1.0) -> dict[str, Any]:
     """Return the growth of each process over the second half, and whether all of it is known and within the limit.
 
-    A stream that ended before `hours`, that a viewer did not receive or that lacks much shows nothing.
+    Hours are those of the recording. A stream that ended before `hours`, that a viewer did not receive or that lacks
+    much shows nothing.
     """
     growth: dict[str, Any] = {}
     for name in JUDGED:
-        series = [{"t_ns": one["t_ns"], **one[name]} for one in readings]
+        series = [{"t_ns": one["t_ns"] * speed, **one[name]} for one in readings]
         found = {column: later_half(series, column) if series else None for column in _SIZES}
         growth[name] = {column: None if one is None else one._asdict() for column, one in found.items()}
     private = [growth[name]["private_dirty"] for name in JUDGED]
-    took_h = (readings[-1]["t_ns"] - readings[0]["t_ns"]) / 3.6e12 if readings else 0.0
-    whole = took_h * 3600 >= hours * 3600 - 3 * PERIOD_S
+    took_h = speed * (readings[-1]["t_ns"] - readings[0]["t_ns"]) / 3.6e12 if readings else 0.0
+    whole = took_h * 3600 >= hours * 3600 - 3 * PERIOD_S * speed
     last: dict[str, Any] = readings[-1] if readings else {"sent": 0, "dropped": 0}
     received = last.get("received", {})
     seen = bool(received) and all(count > 0 for count in received.values())
     complete = last["dropped"] <= MOST_DROPPED * last["sent"]
     return {
         "hours": round(took_h, 3),
+        "speed": speed,
         "mib_per_h": growth,
         "limit_mib_per_h": LIMIT_MIB_PER_H,
         "sent": last["sent"],
@@ -172,17 +178,20 @@ def main(argv: list[str] | None = None) -> int:
     p = CommandParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument("log", type=Path, help="flight log of a run, such as the demo's")
     p.add_argument("--hours", type=float, default=8.0, metavar="H", help="default: 8")
+    p.add_argument("--speed", type=float, default=1.0, metavar="N", help="times as fast as real time (default: 1)")
     p.add_argument("--out", type=Path, default=Path("out/stream"), metavar="DIR", help="default: out/stream")
     args = p.parse_args(argv)
     try:
         if not 0 < args.hours <= 24 * 7:
             raise ValueError(f"--hours {args.hours}: expected a number above 0, at most a week")
+        if not 0.1 <= args.speed <= 100:
+            raise ValueError(f"--speed {args.speed}: expected a number from 0.1 to 100")
         check_result_directory(args.out)
         recording = read_recording(args.log)
         args.out.mkdir(parents=True, exist_ok=True)
     except (RecordingError, OSError, ValueError) as error:
         return bad_input("stream", error)
-    stream = Stream(recording, args.out)
+    stream = Stream(recording, args.out, args.speed)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stream.stop)
     failure = None
@@ -192,7 +201,7 @@ def main(argv: list[str] | None = None) -> int:
         failure = str(error)
         sys.stderr.write(f"stream: {failure}\n")
     lines = stream.file.read_text("ascii").splitlines() if stream.file.exists() else []
-    result = judge([json.loads(line) for line in lines], args.hours)
+    result = judge([json.loads(line) for line in lines], args.hours, args.speed)
     result |= {"failure": failure, "ok": result["ok"] and failure is None}
     write_result(str(args.out / "stream.json"), result)
     for name, found in result["mib_per_h"].items():

@@ -44,6 +44,12 @@ class TestGrowth:
             one["view"]["private_dirty"] -= (len(late) // 2 - number) * 100_000
         assert judge(late, 8.0)["ok"]
 
+    def test_a_faster_stream_grows_by_hours_of_its_recording(self) -> None:
+        result = judge(readings(4.5, 1.0), 5.0, speed=5.0)
+        assert result["ok"] and result["hours"] == pytest.approx(5.0, abs=0.02)
+        assert result["mib_per_h"]["view"]["private_dirty"]["per_h"] == pytest.approx(0.9, abs=0.01)
+        assert not judge(readings(6.0, 1.0), 5.0, speed=5.0)["ok"]
+
     @pytest.mark.parametrize("found", [[], readings(0.0)[:5]])
     def test_too_few_readings_show_nothing(self, found: list[dict[str, Any]]) -> None:
         assert not judge(found, 0.001)["ok"]
@@ -104,7 +110,9 @@ class TestRecording:
         assert main([str(log), "--out", str(tmp_path / "out")]) == 2
         assert "no picture in it" in capsys.readouterr().err and not (tmp_path / "out").exists()
 
-    @pytest.mark.parametrize("hours", ["0", "-1", "nan", "1000"])
-    def test_absurd_durations_are_refused(self, hours: str, tmp_path: Path) -> None:
+    @pytest.mark.parametrize(
+        "option", [*(("--hours", hours) for hours in ("0", "-1", "nan", "1000")), ("--speed", "0"), ("--speed", "nan")]
+    )
+    def test_absurd_durations_and_speeds_are_refused(self, option: tuple[str, str], tmp_path: Path) -> None:
         log = self.record(tmp_path / "flight.mcap")
-        assert main([str(log), "--hours", hours, "--out", str(tmp_path / "out")]) == 2
+        assert main([str(log), *option, "--out", str(tmp_path / "out")]) == 2
