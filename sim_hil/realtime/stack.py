@@ -22,6 +22,7 @@ from sim_hil.realtime.robots import BRIDGE_SOCKET, GO2, RunAddress, StackRobot
 
 ProcessName = Literal["robot", "bridge", "runner"]
 READY_LINE = "edge-hil: ready"
+STALLS = "stalls.jsonl"
 ARMED_LINE = "armed and driving"
 
 # Run as modules of this interpreter, so that any virtual environment will do, activated or not.
@@ -36,6 +37,8 @@ ROBOT_PRIORITY = 35
 """Real-time priority of the robot's side where permitted: a robot has a computer of its own, so neither ordinary
 programs nor reasoning, which computes for long, may slow it. Ticks and the bridge come first.
 """
+STALL_PRIORITY = BRIDGE_PRIORITY + 10
+"""Real-time priority of the watch on the machine's own stalls, above everything of the stack."""
 READY_TIMEOUT_S = 120.0
 BRIDGE_TIMEOUT_S = 30.0
 GRACE_S = 12.0
@@ -132,6 +135,16 @@ class Stack:
         """Return the ids of the running processes by command name."""
         found = {"edge-hil": self.robot, "edge-bridge": self.bridge, "edge-run": self.runner}
         return {name: child.process.pid for name, child in found.items() if child is not None and child.running}
+
+    @property
+    def stalls(self) -> Path:
+        """The machine's stalls, written since `watch_stalls`; see `sim_hil.realtime.host_stall.read_stalls`."""
+        return self.options.folder / STALLS
+
+    def watch_stalls(self) -> None:
+        """Start the process that measures the machine's own stalls. Raises StepError."""
+        command = [sys.executable, "-m", "sim_hil.realtime.host_stall", str(self.stalls)]
+        self._children.start("host-stall", command, fifo_priority=STALL_PRIORITY)
 
     def start_robot(self, tick: Tick) -> None:
         """Start the simulated robot and wait until it is ready. Raises StepError."""

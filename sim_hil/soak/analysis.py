@@ -22,6 +22,8 @@ from edge.core.cli import write_whole
 from edge.core.geometry import SE2
 from edge.flightlog.reader import RecordingError, jpeg_bytes, read_messages
 from firmware_bridge.system.input_file import read_json
+from sim_hil.realtime.host_stall import read_stalls
+from sim_hil.realtime.stack import STALLS
 from sim_hil.realtime.truth import read_lines
 from sim_hil.soak.leg import EVENTS, LEG, SAMPLES
 
@@ -264,6 +266,7 @@ def analyse(folder: Path) -> dict[str, Any]:
         "fell": trace.end.get("fell", False),
         "command_gap_ms": [round(float(gap), 4) for gap in trace.command_gap_ms],
         "command_ns": [int(t) for t in trace.command_ns],
+        "stalls": read_stalls(folder / STALLS).tolist(),
         "truth": [
             [int(t), *(round(float(v), 3) for v in pose)]
             for t, pose in zip(trace.pose_ns[::5], trace.pose[::5], strict=True)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from reporting.plot_style import BAD, COMMAND, INK, MUTED, PERSON, TRUTH, legend_above, new_figure, png, tidy
 from sim_hil.scene.map import draw_map, draw_mark, draw_path, map_view
 from sim_hil.scene.scene import Scene
-from sim_hil.soak.trends import BRIDGE_PERIOD_MS, SERIES, offsets_s, soak_times_s, trend, windows
+from sim_hil.soak.trends import SERIES, jitter_ms, offsets_s, soak_times_s, trend, windows
 from sim_hil.soak.verdict import MIB, process_lives
 
 Array = NDArray[np.float64]
@@ -41,8 +41,7 @@ def timing(legs: Sequence[Analysis]) -> bytes:
             columns[0].append((at, np.array(life["tick_ms"], float)))
             columns[1].append((at, np.array([np.nan if v is None else v for v in life["delay_s"]], float)))
             columns[2].append((_minutes(leg, offset_s, life["ready_ns"]), np.array(life["generation_ms"], float)))
-        jitter = np.abs(np.array(leg["command_gap_ms"], float) - BRIDGE_PERIOD_MS)
-        columns[3].append((_minutes(leg, offset_s, leg["command_ns"]), jitter))
+        columns[3].append((_minutes(leg, offset_s, leg["command_ns"]), jitter_ms(leg)))
     labels = ("tick, ms", "Δt, s", "generation, ms", "bridge jitter, ms")
     for each, label, data, name in zip(axes, labels, columns, SERIES, strict=True):
         _over_time(each, data)
@@ -124,8 +123,8 @@ def histograms(legs: Sequence[Analysis]) -> bytes:
     """Plot histograms of ticks and of the bridge's jitter on a logarithmic scale, so that rare values show."""
     figure = new_figure(5.4, 4.2)
     ticks = [v for leg in legs for life in leg["lives"] for v in life["tick_ms"]]
-    gaps = [abs(v - BRIDGE_PERIOD_MS) for leg in legs for v in leg["command_gap_ms"]]
-    panels = ((ticks, "tick: deadline to command sent, ms", TRUTH), (gaps, "bridge: |gap − 20 ms|, ms", COMMAND))
+    jitter = [off for leg in legs for off in jitter_ms(leg).tolist()]
+    panels = ((ticks, "tick: deadline to command sent, ms", TRUTH), (jitter, "bridge: |gap − 20 ms|, ms", COMMAND))
     for axes, (values, label, colour) in zip(figure.subplots(2, 1), panels, strict=True):
         if values:
             axes.hist(values, bins=80, color=colour, log=True)

@@ -117,6 +117,7 @@ class Leg:
                 schedule = FaultSchedule(self._menu, self.options.seed, self.options.number)
                 self._injector = Injector(self._stack, schedule, self._note)
             try:
+                self._stack.watch_stalls()
                 self._stack.start_robot(self._wait)
                 why = self._lives_of_runners()
             except _StoppedError:

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import theilslopes
 
+from sim_hil.realtime.host_stall import Stalls, stalled_ns
+
 Array = NDArray[np.float64]
 Analysis = Mapping[str, Any]
 
@@ -56,8 +58,27 @@ def _of_lives(stamps: str, values: str) -> Callable[[Analysis], tuple[list[int],
     return read
 
 
+def stalls_of(leg: Analysis) -> Stalls:
+    """Return a leg's stalls of the machine; none in a leg of a release that did not measure them."""
+    return np.array(leg.get("stalls", []), np.int64).reshape(-1, 2)
+
+
+def jitter_ms(leg: Analysis) -> Array:
+    """Return how far each gap between two commands [n] is off the bridge's period, less the machine's stalls in it, ms.
+
+    A gap that is too short follows one that a stall made too long: that stall counts.
+    """
+    off: Array = np.array(leg["command_gap_ms"], float) - BRIDGE_PERIOD_MS
+    end_ns = np.array(leg["command_ns"], np.int64)
+    begin_ns = end_ns - np.rint((off + BRIDGE_PERIOD_MS) * 1e6).astype(np.int64)
+    stalled = stalled_ns(stalls_of(leg), begin_ns, end_ns) / 1e6
+    follows = np.abs(begin_ns[1:] - end_ns[:-1]) < 1_000_000
+    before = np.concatenate((np.zeros(min(1, len(off))), np.where(follows, stalled[:-1], 0)))
+    return np.maximum(np.abs(off) - np.where(off > 0, stalled, before), 0)
+
+
 def _jitter(leg: Analysis) -> tuple[list[int], list[float | None]]:
-    return leg["command_ns"], [abs(gap - BRIDGE_PERIOD_MS) for gap in leg["command_gap_ms"]]
+    return leg["command_ns"], jitter_ms(leg).tolist()
 
 
 SERIES: Final[Mapping[str, Series]] = {

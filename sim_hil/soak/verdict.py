@@ -14,7 +14,7 @@ from scipy.stats import theilslopes
 from edge.core.stats import percentiles
 from sim_hil.scene.table import Table
 from sim_hil.soak.faults import SoakInputError, read_file
-from sim_hil.soak.trends import BRIDGE_PERIOD_MS, SERIES, trends
+from sim_hil.soak.trends import BRIDGE_PERIOD_MS, SERIES, jitter_ms, stalls_of, trends
 
 DEFAULT_BUDGET: Final = Path(__file__).with_name("budget.toml")
 PASS, FAIL, UNDECIDED = "PASS", "FAIL", "UNDECIDED"
@@ -178,8 +178,12 @@ def measures(legs: Sequence[Analysis], samples: Sequence[Samples], menu: Sequenc
     ages = [v for life in lives for v in life["frame_age_ms"] if v is not None]
     _points(found, "frame_age_ms", ages, "ms", "p50", "p99", "max")
     _points(found, "generation_ms", [v for life in lives for v in life["generation_ms"]], "ms", "p50", "p99", "max")
-    jitter = [abs(gap - BRIDGE_PERIOD_MS) for leg in legs for gap in leg["command_gap_ms"]]
+    jitter = [off for leg in legs for off in jitter_ms(leg).tolist()]
     _points(found, "bridge_jitter_ms", jitter, "ms", "p50", "p99", "p999", "max")
+    stalled = [abs(gap - BRIDGE_PERIOD_MS) for leg in legs for gap in leg["command_gap_ms"]]
+    _points(found, "bridge_jitter_with_stalls_ms", stalled, "ms", "max")
+    stalls = [float(woken_ns - due_ns) / 1e6 for leg in legs for due_ns, woken_ns in stalls_of(leg)]
+    _points(found, "machine_stall_ms", stalls, "ms", "p50", "max")
     ticks, missed = sum(life["ticks"] for life in lives), sum(life["missed"] for life in lives)
     found["missed_percent"] = Measure(100 * missed / (ticks + missed) if ticks else None, "%", ticks + missed)
     errors = [life["delay_error_ms_max"] for life in lives if life["delay_error_ms_max"] is not None]

@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 from edge.flightlog.recorder import space_refusal
+from sim_hil.realtime.host_stall import HostStall
 from sim_hil.realtime.robots import ROBOTS
 from sim_hil.realtime.stack import socket_dir
 from tools.faults.__main__ import run_row
-from tools.faults.host_stall import HostStall
 from tools.faults.rig.processes import Rig
 from tools.faults.rows import rows
 

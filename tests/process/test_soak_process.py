@@ -21,6 +21,7 @@ import psutil
 import pytest
 
 from edge.run.say import say
+from sim_hil.realtime.stack import STALLS
 from sim_hil.realtime.truth import read_lines
 from sim_hil.scene.scene import Vec3
 from sim_hil.soak import cli, leg
@@ -191,6 +192,14 @@ def test_timing_comes_from_ticks_and_the_wire(soaked: Soaked) -> None:
     off_ms = [abs(gap_ms - 20.0) for gap_ms in gaps_ms if 5.0 < gap_ms < 500.0]
     assert found["bridge_jitter_ms.p50"]["count"] == len(off_ms) > 250
     assert found["bridge_jitter_ms.p50"]["value"] == pytest.approx(statistics.median(off_ms), abs=0.01)
+
+
+@pytest.mark.slow
+def test_the_machines_own_stalls_are_measured_beside_the_run(soaked: Soaked) -> None:
+    first, *late = read_lines(soaked.leg / STALLS)
+    assert set(first) == {"real_time"}
+    counted = soaked.result["measures"]["machine_stall_ms.max"]["count"]
+    assert counted == 0 or (first["real_time"] and 0 < counted <= len(late))
 
 
 @pytest.mark.slow

@@ -19,8 +19,8 @@ from pathlib import Path
 import pytest
 
 from edge.flightlog.recorder import space_refusal
+from sim_hil.realtime.host_stall import HostStall
 from sim_hil.realtime.robots import free_domain
-from tools.faults.host_stall import HostStall
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 GO2_SIM = REPOSITORY / "firmware_bridge" / "robots" / "go2_sim.toml"

@@ -37,10 +37,10 @@ from edge.flightlog.recorder import space_refusal
 from firmware_bridge.system.terminal import CommandParser
 from sim_hil.protocols.fault_socket import FaultError
 from sim_hil.realtime.children import StepError, uninterrupted
+from sim_hil.realtime.host_stall import HostStall
 from sim_hil.realtime.robots import GO2, MAX_DOMAIN, ROBOTS, StackRobot
 from sim_hil.realtime.stack import socket_dir
 from tools.faults.busy import MOST_BUSY, busy_processes
-from tools.faults.host_stall import HostStall
 from tools.faults.measure import Sample, injection
 from tools.faults.report import RowResult, markdown, read_results, result, show
 from tools.faults.rig.processes import Rig

@@ -7,7 +7,7 @@ import signal
 import time
 from dataclasses import dataclass, field
 
-from tools.faults.host_stall import HostStall
+from sim_hil.realtime.host_stall import HostStall
 from tools.faults.rig.processes import Rig
 from tools.faults.rig.received import ReceivedCommand, first_lasting, longest_age_ms, longest_gap_ms, moves
 from tools.faults.rows import Judge, Row

@@ -35,10 +35,10 @@ from edge.core.cli import (
 )
 from firmware_bridge.client import BridgeClient, BridgeStatus, BridgeUnavailable
 from sim_hil.realtime.children import Child, Children, StepError
+from sim_hil.realtime.host_stall import HostStall
 from sim_hil.realtime.robots import BRIDGE_SOCKET, ROBOTS, RunAddress, free_port
 from sim_hil.realtime.stack import COMMANDS, READY_LINE, socket_dir
 from sim_hil.realtime.truth import LineTail
-from tools.faults.host_stall import HostStall
 from tools.interop.mavproxy_session import MavProxy
 from tools.report.machine import machine_facts
 

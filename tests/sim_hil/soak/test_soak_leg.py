@@ -46,7 +46,7 @@ def test_an_instruction_is_sent_again_to_a_runner_too_busy_to_answer(
     def nothing(*_: object) -> int:
         return 0
 
-    calls = ("start_robot", "start_bridge", "start_runner", "end", "__exit__")
+    calls = ("watch_stalls", "start_robot", "start_bridge", "start_runner", "end", "__exit__")
     running = {name: SimpleNamespace(running=True) for name in ("robot", "bridge", "runner")}
     values: dict[str, Any] = {"trace": tmp_path / "t", "instructions": tmp_path / "say", "runs": 1}
     stack = type("Stack", (), {**dict.fromkeys(calls, nothing), "__enter__": nothing, "armed": lambda _: True})()

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim_hil.soak.trends import SERIES, trend, trends, windows
+from sim_hil.soak.trends import SERIES, jitter_ms, trend, trends, windows
 
 S = 1_000_000_000
 
@@ -53,3 +53,35 @@ def test_outliers_do_not_bend_a_trend() -> None:
     values[[3, 30]] = 500.0
     found = trend(np.arange(40) * 60.0, values)
     assert found is not None and found.per_h == pytest.approx(0.0, abs=1e-9)
+
+
+def commands(gaps_ms: list[float], stalls_ms: list[tuple[float, float]] | None = None) -> dict[str, Any]:
+    """A leg with these gaps between commands, the first of which begins at 1 s; stalls in ms after that."""
+    end_ns = S + np.cumsum(np.array(gaps_ms) * 1e6).astype(int)
+    leg = {"command_gap_ms": gaps_ms, "command_ns": end_ns.tolist()}
+    if stalls_ms is not None:
+        leg["stalls"] = [[S + round(a * 1e6), S + round(b * 1e6)] for a, b in stalls_ms]
+    return leg
+
+
+class TestJitter:
+    def test_it_is_the_distance_from_the_period(self) -> None:
+        assert jitter_ms(commands([20.0, 45.5, 9.0], [])).tolist() == pytest.approx([0.0, 25.5, 11.0])
+
+    def test_a_stall_of_the_machine_in_a_late_gap_is_not_the_bridges(self) -> None:
+        found = jitter_ms(commands([20.0, 45.0, 9.0], [(38.0, 60.0)]))
+        assert found[:2].tolist() == pytest.approx([0.0, 3.0])
+
+    def test_the_short_gap_after_a_stalled_one_is_the_machines_too(self) -> None:
+        assert jitter_ms(commands([20.0, 45.0, 3.0, 3.0], [(40.0, 55.0)])).tolist() == pytest.approx(
+            [0, 10.0, 2.0, 17.0]
+        )
+
+    def test_a_stall_that_explains_more_than_the_delay_leaves_none(self) -> None:
+        assert jitter_ms(commands([25.0], [(3.0, 23.0)])).tolist() == [0.0]
+
+    def test_a_stall_elsewhere_changes_nothing(self) -> None:
+        assert jitter_ms(commands([20.0, 45.0], [(0.0, 20.0), (65.0, 90.0)])).tolist() == pytest.approx([0.0, 25.0])
+
+    def test_a_leg_without_measured_stalls_has_none(self) -> None:
+        assert jitter_ms(commands([45.0])).tolist() == pytest.approx([25.0])

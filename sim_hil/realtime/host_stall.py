@@ -1,0 +1,139 @@
+"""Measures how long a shared machine stalls, which limits the accuracy of a bound on other processes.
+
+    python -m sim_hil.realtime.host_stall stalls.jsonl     # until SIGINT or SIGTERM
+
+Started with a real-time priority above all that it watches over, no program delays it: a sleep that ends late is then
+the machine's own stall, such as a virtual machine's that shares its processors.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_hil.realtime.truth import read_lines
+
+_SLEEP_S = 0.001
+_STALL_NS = 5_000_000  # a 1 ms sleep that takes longer: the machine did not run this thread in time
+_KEEP = 10_000
+REAL_TIME: Final = "real_time"
+"""Key of the file's first line: whether the process had a real-time priority."""
+
+Stalls = NDArray[np.int64]
+"""[n, 2]: when a sleep should have ended, and when it did, ns; in order and apart from each other."""
+
+
+def watch_sleeps(ended: Callable[[], bool], add: Callable[[int, int], None]) -> None:
+    """Sleep 1 ms again and again until `ended()`; give each late sleep to `add(due_ns, woken_ns)`."""
+    while not ended():
+        due_ns = time.monotonic_ns() + int(_SLEEP_S * 1e9)
+        time.sleep(_SLEEP_S)
+        woken_ns = time.monotonic_ns()
+        if woken_ns - due_ns > _STALL_NS:
+            add(due_ns, woken_ns)
+
+
+class HostStall:
+    """Context manager that measures the delays of repeated 1 ms sleeps.
+
+    A bound in milliseconds on other processes is meaningful only if the machine schedules processes in time.
+    """
+
+    def __init__(self) -> None:
+        self._stalls: deque[tuple[int, int]] = deque(maxlen=_KEEP)  # (when the sleep should have ended, when it did)
+        self._ending = threading.Event()
+        self._thread = threading.Thread(
+            target=watch_sleeps, args=(self._ending.is_set, self.add), name="host-stall", daemon=True
+        )
+
+    def __enter__(self) -> HostStall:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ending.set()
+        self._thread.join()
+
+    def add(self, due_ns: int, woken_ns: int) -> None:
+        """Record a sleep that ended at `woken_ns` instead of `due_ns`."""
+        self._stalls.append((due_ns, woken_ns))
+
+    def between_ns(self, begin_ns: int, end_ns: int) -> int:
+        """Return the sum of the stalls inside a window, ns; 0 on an idle machine."""
+        return sum(max(min(late, end_ns) - max(due, begin_ns), 0) for due, late in list(self._stalls))
+
+
+def read_stalls(path: Path) -> Stalls:
+    """Read the file of the process; none of one without a real-time priority, or that does not exist. Raises OSError.
+
+    Stalls of several processors that overlap are one.
+    """
+    lines = list(read_lines(path)) if path.exists() else []
+    if not lines or not lines[0].get(REAL_TIME):
+        return np.empty((0, 2), np.int64)
+    merged: list[list[int]] = []
+    for due_ns, woken_ns in sorted((line["due_ns"], line["woken_ns"]) for line in lines[1:]):
+        if merged and due_ns <= merged[-1][1]:
+            merged[-1][1] = max(merged[-1][1], woken_ns)
+        else:
+            merged.append([due_ns, woken_ns])
+    return np.array(merged, np.int64).reshape(-1, 2)
+
+
+def stalled_ns(stalls: Stalls, begin_ns: NDArray[np.int64], end_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return how long the machine stalled within each of n windows, ns [n]."""
+    spans = stalls[:, 1] - stalls[:, 0]
+    before = np.concatenate(([0], np.cumsum(spans)))  # stalled until each stall's begin
+
+    def until(at_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        index = np.searchsorted(stalls[:, 0], at_ns, side="right")
+        if not len(stalls):
+            return np.zeros_like(at_ns)
+        newest = np.maximum(index - 1, 0)
+        inside = np.clip(at_ns - stalls[newest, 0], 0, spans[newest])
+        return np.where(index > 0, before[newest] + inside, 0)
+
+    return until(end_ns) - until(begin_ns)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Write the stalls of every processor to a JSON-lines file until SIGINT or SIGTERM."""
+    (path,) = sys.argv[1:] if argv is None else argv
+    ending = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ending.set())
+    real_time = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK in (os.SCHED_FIFO, os.SCHED_RR)
+    with Path(path).open("w", encoding="ascii", buffering=1) as file:
+        file.write(json.dumps({REAL_TIME: real_time}) + "\n")
+
+        def watch(cpu: int) -> None:
+            with suppress(OSError):  # the processor is no longer there: watch on another one
+                os.sched_setaffinity(0, {cpu})
+
+            def add(due_ns: int, woken_ns: int) -> None:
+                file.write(json.dumps({"cpu": cpu, "due_ns": due_ns, "woken_ns": woken_ns}) + "\n")
+
+            watch_sleeps(ending.is_set, add)
+
+        threads = [threading.Thread(target=watch, args=(cpu,)) for cpu in sorted(os.sched_getaffinity(0))]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
