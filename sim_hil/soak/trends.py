@@ -74,7 +74,8 @@ def jitter_ms(leg: Analysis) -> Array:
     stalled = stalled_ns(stalls_of(leg), begin_ns, end_ns) / 1e6
     follows = np.abs(begin_ns[1:] - end_ns[:-1]) < 1_000_000
     before = np.concatenate((np.zeros(min(1, len(off))), np.where(follows, stalled[:-1], 0)))
-    return np.maximum(np.abs(off) - np.where(off > 0, stalled, before), 0)
+    jitter: Array = np.maximum(np.abs(off) - np.where(off > 0, stalled, before), 0)
+    return jitter
 
 
 def _jitter(leg: Analysis) -> tuple[list[int], list[float | None]]:
