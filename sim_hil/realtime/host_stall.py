@@ -2,8 +2,9 @@
 
     python -m sim_hil.realtime.host_stall stalls.jsonl     # until SIGINT or SIGTERM
 
-Started with a real-time priority above all that it watches over, no program delays it: a sleep that ends late is then
-the machine's own stall, such as a virtual machine's that shares its processors.
+With a real-time priority above all that it watches over, hardly anything but the machine delays this process: a sleep
+that ends late is then a stall, such as one of a virtual machine whose processor time is limited. It takes some 3 % of a
+core for two processors.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
@@ -23,23 +24,28 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.core.cli import EXIT_CHECK_FAILED, EXIT_DONE
+from firmware_bridge.core.config import BRIDGE_PRIORITY
 from sim_hil.realtime.truth import read_lines
 
 _SLEEP_S = 0.001
-_STALL_NS = 5_000_000  # a 1 ms sleep that takes longer: the machine did not run this thread in time
+_PROCESS_SLEEP_S = 0.002  # costs half as much
+_STALL_NS = 5_000_000  # a sleep that ends later than this: the machine did not run this thread in time
 _KEEP = 10_000
+STALL_PRIORITY: Final = BRIDGE_PRIORITY + 10
+"""Real-time priority of the process, above everything that drives a robot."""
 REAL_TIME: Final = "real_time"
-"""Key of the file's first line: whether the process had a real-time priority."""
+"""Key of the line with which each processor's watch begins: whether it has a priority above the bridge's."""
 
 Stalls = NDArray[np.int64]
 """[n, 2]: when a sleep should have ended, and when it did, ns; in order and apart from each other."""
 
 
-def watch_sleeps(ended: Callable[[], bool], add: Callable[[int, int], None]) -> None:
-    """Sleep 1 ms again and again until `ended()`; give each late sleep to `add(due_ns, woken_ns)`."""
+def watch_sleeps(ended: Callable[[], bool], add: Callable[[int, int], None], sleep_s: float = _SLEEP_S) -> None:
+    """Sleep again and again until `ended()`; give each late sleep to `add(due_ns, woken_ns)`."""
     while not ended():
-        due_ns = time.monotonic_ns() + int(_SLEEP_S * 1e9)
-        time.sleep(_SLEEP_S)
+        due_ns = time.monotonic_ns() + round(sleep_s * 1e9)
+        time.sleep(sleep_s)
         woken_ns = time.monotonic_ns()
         if woken_ns - due_ns > _STALL_NS:
             add(due_ns, woken_ns)
@@ -75,16 +81,17 @@ class HostStall:
         return sum(max(min(late, end_ns) - max(due, begin_ns), 0) for due, late in list(self._stalls))
 
 
-def read_stalls(path: Path) -> Stalls:
-    """Read the file of the process; none of one without a real-time priority, or that does not exist. Raises OSError.
+def read_stalls(path: Path) -> Stalls | None:
+    """Read the file of the process; None where a watch lacked its priority or there is no file. Raises OSError.
 
     Stalls of several processors that overlap are one.
     """
     lines = list(read_lines(path)) if path.exists() else []
-    if not lines or not lines[0].get(REAL_TIME):
-        return np.empty((0, 2), np.int64)
+    begins = [line[REAL_TIME] for line in lines if REAL_TIME in line]
+    if not begins or not all(begins):
+        return None
     merged: list[list[int]] = []
-    for due_ns, woken_ns in sorted((line["due_ns"], line["woken_ns"]) for line in lines[1:]):
+    for due_ns, woken_ns in sorted((line["due_ns"], line["woken_ns"]) for line in lines if "due_ns" in line):
         if merged and due_ns <= merged[-1][1]:
             merged[-1][1] = max(merged[-1][1], woken_ns)
         else:
@@ -108,31 +115,48 @@ def stalled_ns(stalls: Stalls, begin_ns: NDArray[np.int64], end_ns: NDArray[np.i
     return until(end_ns) - until(begin_ns)
 
 
+def woken_after(stalls: Stalls, at_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return when the stalls end in which n instants lie, and the instants [n] themselves outside of stalls, ns."""
+    if not len(stalls):
+        return at_ns
+    index = np.searchsorted(stalls[:, 0], at_ns, side="right") - 1
+    return np.maximum(at_ns, np.where(index >= 0, stalls[np.maximum(index, 0), 1], 0))
+
+
 def main(argv: Sequence[str] | None = None) -> int:
-    """Write the stalls of every processor to a JSON-lines file until SIGINT or SIGTERM."""
+    """Write the stalls of every processor to a JSON-lines file until SIGINT or SIGTERM; 1 if the file takes no more."""
     (path,) = sys.argv[1:] if argv is None else argv
     ending = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ending.set())
-    real_time = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK in (os.SCHED_FIFO, os.SCHED_RR)
+    failed: list[OSError] = []
     with Path(path).open("w", encoding="ascii", buffering=1) as file:
-        file.write(json.dumps({REAL_TIME: real_time}) + "\n")
+
+        def write(line: Mapping[str, object]) -> None:
+            try:
+                file.write(json.dumps(line) + "\n")
+            except OSError as error:  # a full disk
+                failed.append(error)
+                ending.set()
 
         def watch(cpu: int) -> None:
             with suppress(OSError):  # the processor is no longer there: watch on another one
                 os.sched_setaffinity(0, {cpu})
+            real_time = os.sched_getscheduler(0) in (os.SCHED_FIFO, os.SCHED_RR)
+            above = real_time and os.sched_getparam(0).sched_priority > BRIDGE_PRIORITY
+            write({"cpu": cpu, REAL_TIME: above})
 
             def add(due_ns: int, woken_ns: int) -> None:
-                file.write(json.dumps({"cpu": cpu, "due_ns": due_ns, "woken_ns": woken_ns}) + "\n")
+                write({"cpu": cpu, "due_ns": due_ns, "woken_ns": woken_ns})
 
-            watch_sleeps(ending.is_set, add)
+            watch_sleeps(ending.is_set, add, _PROCESS_SLEEP_S)
 
         threads = [threading.Thread(target=watch, args=(cpu,)) for cpu in sorted(os.sched_getaffinity(0))]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
-    return 0
+    return EXIT_CHECK_FAILED if failed else EXIT_DONE
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from edge.state.switches import SwitchOptions
 from firmware_bridge.core.config import BRIDGE_PRIORITY
 from sim_hil.protocols.fault_socket import FaultClient
 from sim_hil.realtime.children import Child, Children, Tick, uninterrupted
+from sim_hil.realtime.host_stall import STALL_PRIORITY
 from sim_hil.realtime.robots import BRIDGE_SOCKET, GO2, RunAddress, StackRobot
 
 ProcessName = Literal["robot", "bridge", "runner"]
@@ -37,8 +38,6 @@ ROBOT_PRIORITY = 35
 """Real-time priority of the robot's side where permitted: a robot has a computer of its own, so neither ordinary
 programs nor reasoning, which computes for long, may slow it. Ticks and the bridge come first.
 """
-STALL_PRIORITY = BRIDGE_PRIORITY + 10
-"""Real-time priority of the watch on the machine's own stalls, above everything of the stack."""
 READY_TIMEOUT_S = 120.0
 BRIDGE_TIMEOUT_S = 30.0
 GRACE_S = 12.0
@@ -90,6 +89,7 @@ class Stack:
         self.bridge: Child | None = None
         self.runner: Child | None = None
         self.faults: FaultClient | None = None
+        self._watch: Child | None = None
         self._children = Children(options.folder, grace_s=GRACE_S)
         self._sockets = Path(tempfile.mkdtemp(prefix="tic-"))
         file = options.folder / "robot.toml"
@@ -109,6 +109,8 @@ class Stack:
     ) -> None:
         with uninterrupted():
             self._children.__exit__(kind, error, trace)
+            if self._watch is not None:
+                self._children.end(self._watch)
             if self.faults is not None:
                 self.faults.close()
             shutil.rmtree(self._sockets, ignore_errors=True)
@@ -142,9 +144,10 @@ class Stack:
         return self.options.folder / STALLS
 
     def watch_stalls(self) -> None:
-        """Start the process that measures the machine's own stalls. Raises StepError."""
+        """Start the process that measures the machine's own stalls; its end ends nothing else. Raises StepError."""
         command = [sys.executable, "-m", "sim_hil.realtime.host_stall", str(self.stalls)]
-        self._children.start("host-stall", command, fifo_priority=STALL_PRIORITY)
+        self._watch = self._children.start("host-stall", command, fifo_priority=STALL_PRIORITY)
+        self._children.forget(self._watch)
 
     def start_robot(self, tick: Tick) -> None:
         """Start the simulated robot and wait until it is ready. Raises StepError."""

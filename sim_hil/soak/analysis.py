@@ -251,6 +251,7 @@ def analyse(folder: Path) -> dict[str, Any]:
     lives = [life for life in read if life is not None]
     disturbed = disturbed_spans(events)
     drift = [segment for life in lives for segment in drift_segments(life.odometry, trace, disturbed)]
+    stalls = read_stalls(folder / STALLS)
     analysis = {
         "leg": about,
         "begin_ns": events[0]["t_ns"] if events else 0,
@@ -266,7 +267,7 @@ def analyse(folder: Path) -> dict[str, Any]:
         "fell": trace.end.get("fell", False),
         "command_gap_ms": [round(float(gap), 4) for gap in trace.command_gap_ms],
         "command_ns": [int(t) for t in trace.command_ns],
-        "stalls": read_stalls(folder / STALLS).tolist(),
+        "stalls": None if stalls is None else stalls.tolist(),
         "truth": [
             [int(t), *(round(float(v), 3) for v in pose)]
             for t, pose in zip(trace.pose_ns[::5], trace.pose[::5], strict=True)

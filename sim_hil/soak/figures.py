@@ -124,7 +124,10 @@ def histograms(legs: Sequence[Analysis]) -> bytes:
     figure = new_figure(5.4, 4.2)
     ticks = [v for leg in legs for life in leg["lives"] for v in life["tick_ms"]]
     jitter = [off for leg in legs for off in jitter_ms(leg).tolist()]
-    panels = ((ticks, "tick: deadline to command sent, ms", TRUTH), (jitter, "bridge: |gap − 20 ms|, ms", COMMAND))
+    panels = (
+        (ticks, "tick: deadline to command sent, ms", TRUTH),
+        (jitter, "bridge jitter without stalls, ms", COMMAND),
+    )
     for axes, (values, label, colour) in zip(figure.subplots(2, 1), panels, strict=True):
         if values:
             axes.hist(values, bins=80, color=colour, log=True)

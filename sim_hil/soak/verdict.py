@@ -12,6 +12,7 @@ import numpy as np
 from scipy.stats import theilslopes
 
 from edge.core.stats import percentiles
+from sim_hil.realtime.host_stall import STALL_PRIORITY
 from sim_hil.scene.table import Table
 from sim_hil.soak.faults import SoakInputError, read_file
 from sim_hil.soak.trends import BRIDGE_PERIOD_MS, SERIES, jitter_ms, stalls_of, trends
@@ -183,7 +184,10 @@ def measures(legs: Sequence[Analysis], samples: Sequence[Samples], menu: Sequenc
     stalled = [abs(gap - BRIDGE_PERIOD_MS) for leg in legs for gap in leg["command_gap_ms"]]
     _points(found, "bridge_jitter_with_stalls_ms", stalled, "ms", "max")
     stalls = [float(woken_ns - due_ns) / 1e6 for leg in legs for due_ns, woken_ns in stalls_of(leg)]
-    _points(found, "machine_stall_ms", stalls, "ms", "p50", "max")
+    unmeasured = sum(leg.get("stalls") is None for leg in legs)
+    note = f"not measured in {unmeasured} legs: needs real-time priority {STALL_PRIORITY}" if unmeasured else ""
+    for point, value in percentiles(stalls, "p50", "max").items():
+        found[f"machine_stall_ms.{point}"] = Measure(value, "ms", len(stalls), note=note)
     ticks, missed = sum(life["ticks"] for life in lives), sum(life["missed"] for life in lives)
     found["missed_percent"] = Measure(100 * missed / (ticks + missed) if ticks else None, "%", ticks + missed)
     errors = [life["delay_error_ms_max"] for life in lives if life["delay_error_ms_max"] is not None]

@@ -7,7 +7,7 @@ no model runs. A reading is written to readings.jsonl every 10 s, so that an end
 SIGTERM end the stream and print what there is. The second half counts: growth of the private memory of the view, and
 of the process that feeds it, of at most 1 MB/h. It shows nothing if a page or Foxglove has received nothing, or if the
 view lacks more than 1 % of the messages. --speed streams faster than real time: hours and growth per hour are then
-those of the log, and growth that comes with time and not with messages shows less.
+those of the log. Viewers come and go no faster: growth with time or with connections shows less.
 """
 
 from __future__ import annotations
@@ -55,6 +55,11 @@ class Recording:
 
     messages: tuple[tuple[float, str, Payload], ...]
     seconds: float
+
+    @property
+    def rate_hz(self) -> float:
+        """Messages a second."""
+        return len(self.messages) / self.seconds
 
 
 def read_recording(log: Path) -> Recording:
@@ -137,11 +142,11 @@ def newest_report(log: Path) -> dict[str, Any]:
     return {}
 
 
-def judge(readings: Sequence[dict[str, Any]], hours: float, speed: float = 1.0) -> dict[str, Any]:
+def judge(readings: Sequence[dict[str, Any]], hours: float, speed: float = 1.0, rate_hz: float = 0.0) -> dict[str, Any]:
     """Return the growth of each process over the second half, and whether all of it is known and within the limit.
 
-    Hours are those of the recording. A stream that ended before `hours`, that a viewer did not receive or that lacks
-    much shows nothing.
+    Hours and `rate_hz`, its messages a second, are those of the recording. A stream that ended before `hours`, that
+    fell behind, that a viewer did not receive or that lacks much shows nothing.
     """
     growth: dict[str, Any] = {}
     for name in JUDGED:
@@ -154,7 +159,8 @@ def judge(readings: Sequence[dict[str, Any]], hours: float, speed: float = 1.0) 
     last: dict[str, Any] = readings[-1] if readings else {"sent": 0, "dropped": 0}
     received = last.get("received", {})
     seen = bool(received) and all(count > 0 for count in received.values())
-    complete = last["dropped"] <= MOST_DROPPED * last["sent"]
+    in_time = last["sent"] >= (1 - MOST_DROPPED) * rate_hz * 3600 * took_h
+    complete = in_time and last["dropped"] <= MOST_DROPPED * last["sent"]
     return {
         "hours": round(took_h, 3),
         "speed": speed,
@@ -201,7 +207,7 @@ def main(argv: list[str] | None = None) -> int:
         failure = str(error)
         sys.stderr.write(f"stream: {failure}\n")
     lines = stream.file.read_text("ascii").splitlines() if stream.file.exists() else []
-    result = judge([json.loads(line) for line in lines], args.hours, args.speed)
+    result = judge([json.loads(line) for line in lines], args.hours, args.speed, recording.rate_hz)
     result |= {"failure": failure, "ok": result["ok"] and failure is None}
     write_result(str(args.out / "stream.json"), result)
     for name, found in result["mib_per_h"].items():

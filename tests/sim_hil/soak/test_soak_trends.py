@@ -70,18 +70,31 @@ class TestJitter:
 
     def test_a_stall_of_the_machine_in_a_late_gap_is_not_the_bridges(self) -> None:
         found = jitter_ms(commands([20.0, 45.0, 9.0], [(38.0, 60.0)]))
-        assert found[:2].tolist() == pytest.approx([0.0, 3.0])
+        assert found[:2].tolist() == pytest.approx([0.0, 5.0])
 
     def test_the_short_gap_after_a_stalled_one_is_the_machines_too(self) -> None:
         assert jitter_ms(commands([20.0, 45.0, 3.0, 3.0], [(40.0, 55.0)])).tolist() == pytest.approx(
             [0, 10.0, 2.0, 17.0]
         )
 
-    def test_a_stall_that_explains_more_than_the_delay_leaves_none(self) -> None:
-        assert jitter_ms(commands([25.0], [(3.0, 23.0)])).tolist() == [0.0]
+    @pytest.mark.parametrize(
+        ("gap_ms", "stall_ms", "left_ms"),
+        [(57.0, (2.0, 19.0), 37.0), (50.0, (0.0, 15.0), 30.0), (25.0, (3.0, 23.0), 2.0), (45.0, (10.0, 45.0), 0.0)],
+    )
+    def test_only_what_stalls_after_a_command_is_due_delays_it(
+        self, gap_ms: float, stall_ms: tuple[float, float], left_ms: float
+    ) -> None:
+        assert jitter_ms(commands([gap_ms], [stall_ms])).tolist() == pytest.approx([left_ms])
+
+    def test_a_stall_in_a_gap_in_time_does_not_explain_an_early_command(self) -> None:
+        assert jitter_ms(commands([20.0, 5.5], [(2.0, 18.0)])).tolist() == pytest.approx([0.0, 14.5])
+
+    def test_a_stall_during_which_the_bridge_sent_a_command_did_not_hold_it(self) -> None:
+        assert jitter_ms(commands([20.0, 45.0], [(10.0, 60.0)])).tolist() == pytest.approx([0.0, 25.0])
 
     def test_a_stall_elsewhere_changes_nothing(self) -> None:
         assert jitter_ms(commands([20.0, 45.0], [(0.0, 20.0), (65.0, 90.0)])).tolist() == pytest.approx([0.0, 25.0])
 
-    def test_a_leg_without_measured_stalls_has_none(self) -> None:
-        assert jitter_ms(commands([45.0])).tolist() == pytest.approx([25.0])
+    @pytest.mark.parametrize("missing", [{}, {"stalls": None}])
+    def test_a_leg_without_measured_stalls_has_none(self, missing: dict[str, None]) -> None:
+        assert jitter_ms(commands([45.0]) | missing).tolist() == pytest.approx([25.0])

@@ -176,9 +176,34 @@ def test_an_undecided_slope_is_not_lost() -> None:
     assert not is_lost(judge(line, Measure(2.0, "MiB/h", 1, low=0.5, high=3.0)))
 
 
+def empty_leg() -> dict[str, Any]:
+    lists = ("lives", "life_ends", "command_gap_ms", "command_ns", "tasks", "drift", "faults", "stalls")
+    nothing = {"real_time_factor": None, "nearest_person": None, "elapsed_s": 60.0, "begin_ns": 0}
+    return {**{key: [] for key in lists}, **nothing}
+
+
+def test_a_stall_of_the_machine_is_reported_and_not_counted_as_the_bridges_jitter() -> None:
+    ms = 1_000_000
+    leg = empty_leg() | {
+        "command_gap_ms": [20.0, 50.0],
+        "command_ns": [20 * ms, 70 * ms],
+        "stalls": [[38 * ms, 69 * ms]],
+    }
+    found = measures([leg], [[]])
+    assert found["bridge_jitter_ms.max"].value == pytest.approx(1.0)
+    assert found["bridge_jitter_with_stalls_ms.max"].value == pytest.approx(30.0)
+    assert found["machine_stall_ms.max"].value == pytest.approx(31.0) and not found["machine_stall_ms.max"].note
+
+
+def test_stalls_that_could_not_be_measured_are_named_and_subtract_nothing() -> None:
+    leg = empty_leg() | {"command_gap_ms": [50.0], "command_ns": [50_000_000], "stalls": None}
+    found = measures([leg, empty_leg()], [[], []])
+    assert found["bridge_jitter_ms.max"].value == pytest.approx(30.0)
+    assert "not measured in 1 legs" in found["machine_stall_ms.max"].note
+
+
 def test_the_coverage_counts_the_kinds_of_the_menu_that_were_injected() -> None:
-    leg: dict[str, Any] = {key: [] for key in ("lives", "life_ends", "command_gap_ms", "command_ns", "tasks", "drift")}
-    leg |= {"real_time_factor": None, "nearest_person": None, "elapsed_s": 60.0, "begin_ns": 0}
+    leg = empty_leg()
     fault = {"fault": "camera-frozen", "end_ns": 2, "moved_m": 1.0, "raised_ns": 1, "other_ns": None}
     leg["faults"] = [{**fault, "name": "camera freezes"}, {**fault, "name": "camera freezes"}]
     found = measures([leg], [[]], ["camera freezes", "camera stops"])

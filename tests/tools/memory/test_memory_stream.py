@@ -50,6 +50,10 @@ class TestGrowth:
         assert result["mib_per_h"]["view"]["private_dirty"]["per_h"] == pytest.approx(0.9, abs=0.01)
         assert not judge(readings(6.0, 1.0), 5.0, speed=5.0)["ok"]
 
+    @pytest.mark.parametrize(("rate_hz", "ok"), [(20.0, True), (21.0, False)])
+    def test_a_stream_that_fell_behind_its_recording_shows_nothing(self, rate_hz: float, ok: bool) -> None:
+        assert judge(readings(0.0), 8.0, rate_hz=rate_hz)["ok"] is ok  # 200 messages in 10 s were sent
+
     @pytest.mark.parametrize("found", [[], readings(0.0)[:5]])
     def test_too_few_readings_show_nothing(self, found: list[dict[str, Any]]) -> None:
         assert not judge(found, 0.001)["ok"]
