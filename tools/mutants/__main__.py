@@ -78,7 +78,7 @@ def _run(module: str, out: Path, end_ns: int) -> str:
     known = {key: result for key, result in results.found.items() if result in DONE}
     known |= read_equivalents().get(module, {})
     session = MutantSession(module, known, end_ns, results.add)
-    options = ["-q", "-p", "no:cacheprovider", "-m", "not slow and not process and not repeated"]
+    options = ["-q", "-p", "no:cacheprovider", "-m", "not process and not repeated"]
     code = pytest.main([*options, *read_targets()[module]], plugins=[session])
     return session.problem or ("" if code in (0, 5) else f"pytest ended with exit code {int(code)}")
 

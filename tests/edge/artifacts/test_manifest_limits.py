@@ -5,15 +5,18 @@ from __future__ import annotations
 import errno
 import shutil
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import onnx
 import pytest
 
 from edge.artifacts import manifest as module
-from edge.artifacts.files import ArtifactError
+from edge.artifacts.files import ArtifactError, FileIdentity
 from edge.artifacts.manifest import (
+    LANGUAGE_PAIR,
     LEAST_ROWS,
     MOST_ROWS,
     Artifacts,
@@ -22,7 +25,8 @@ from edge.artifacts.manifest import (
     check_contract,
     load_artifacts,
 )
-from tests.support.artifact_directory import edit_manifest
+from edge.state.reasoning_text import WAYPOINT_TIMES_S
+from tests.support.artifact_directory import edit_manifest, replace_file
 
 Edit = Callable[[dict[str, Any]], object]
 GIB = 1 << 30
@@ -213,6 +217,31 @@ class TestContract:
             check_contract(changed)
 
 
+class TestGuidance:
+    WAYPOINTS = TensorContract("waypoints", "float", (1, len(WAYPOINT_TIMES_S), 2))
+
+    @staticmethod
+    def guided(artifacts: Artifacts, waypoints: TensorContract) -> Artifacts:
+        def change(graph: GraphContract) -> GraphContract:
+            others = tuple(tensor for tensor in graph.inputs if tensor.name != "last_layer_kv")
+            return replace(graph, inputs=(waypoints, TensorContract("spare", "float", (1,)), *others))
+
+        return with_graph(artifacts, "semantic_context", change)
+
+    def test_one_by_waypoints_is_known_by_its_context_graph(self, artifacts: Artifacts) -> None:
+        assert artifacts.guided_by_waypoints is False
+        guided = self.guided(artifacts, self.WAYPOINTS)
+        assert guided.guided_by_waypoints is True
+        check_contract(guided)
+
+    @pytest.mark.parametrize(
+        "changed", [{"dtype": "float16"}, {"shape": (2, 3, 2)}, {"shape": (1, 3, 3)}, {"shape": (1, 4, 2)}], ids=str
+    )
+    def test_waypoints_of_another_form_are_refused(self, artifacts: Artifacts, changed: dict[str, Any]) -> None:
+        with pytest.raises(ArtifactError, match=r"waypoints is .*, the runner expects float\[1, 3, 2\]"):
+            check_contract(self.guided(artifacts, replace(self.WAYPOINTS, **changed)))
+
+
 class TestSession:
     @staticmethod
     def session(**changes: object) -> Edit:
@@ -260,6 +289,33 @@ class TestFilesAndGraphs:
         edit_manifest(copy, lambda m: m["graphs"].update(another=m["graphs"]["action_expert"]))
         with pytest.raises(ArtifactError, match="graph 'another' is unknown to the runner"):
             load_artifacts(copy)
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("name", LANGUAGE_PAIR)
+    def test_half_a_pair_of_language_graphs_is_unknown(self, copy: Path, name: str) -> None:
+        edit_manifest(copy, lambda m: m["graphs"].update({name: m["graphs"]["language_model"]}))
+        with pytest.raises(ArtifactError, match=f"graph '{name}' is unknown to the runner"):
+            load_artifacts(copy)
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize(("offset", "taken"), [(4, True), (5, False)])
+    def test_weights_without_a_length_begin_at_the_latest_where_their_file_ends(
+        self, copy: Path, offset: int, taken: bool
+    ) -> None:
+        weights = onnx.TensorProto(name="w", data_type=1, dims=[0], data_location=onnx.TensorProto.EXTERNAL)
+        for key, value in (("location", "action_expert.onnx.data"), ("offset", str(offset))):
+            weights.external_data.add(key=key, value=value)
+        graph = onnx.helper.make_graph([], "g", [], [], initializer=[weights])
+        replace_file(copy, "action_expert.onnx", onnx.helper.make_model(graph).SerializeToString())
+        replace_file(copy, "action_expert.onnx.data", b"1234")
+        edit_manifest(copy, lambda m: m["graphs"]["action_expert"].update(data_files=["action_expert.onnx.data"]))
+        with nullcontext() if taken else pytest.raises(ArtifactError, match="weights beyond the 4 bytes"):
+            load_artifacts(copy)
+
+    def test_a_data_file_that_is_gone_has_changed(self, artifacts: Artifacts, copy: Path) -> None:
+        hashed = {"weights.data": FileIdentity.of(copy / "manifest.json")}
+        with pytest.raises(ArtifactError, match=r"weights\.data: changed while it was being opened"):
+            replace(artifacts, directory=copy, identities=hashed).check_unchanged(["weights.data"])
 
     @pytest.mark.slow
     @pytest.mark.parametrize("graph", ["vision_encoder", "semantic_context", "action_expert"])
