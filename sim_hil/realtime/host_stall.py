@@ -3,7 +3,7 @@
     python -m sim_hil.realtime.host_stall stalls.jsonl     # until SIGINT or SIGTERM
 
 With a real-time priority above all that it watches over, hardly anything but the machine delays this process: a sleep
-that ends late is then a stall, such as one of a virtual machine whose processor time is limited. It takes some 3 % of a
+that ends late is then a stall, such as one of a virtual machine whose processor time is limited. It takes 4 % of a
 core for two processors.
 """
 
