@@ -1,1 +1,1 @@
-"""One run: the robot's inputs, the control and reasoning threads, and the session that arms, drives and ends them."""
+"""One run: the control and reasoning threads, and the session that arms, drives and ends them."""

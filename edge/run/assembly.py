@@ -22,9 +22,9 @@ from edge.power.governor.plan import read_power_plan
 from edge.power.monitor import Activity, PowerMonitor
 from edge.power.run_power import make_power_monitor
 from edge.reasoning.generation_cycle import Mode, ReasoningConfig
+from edge.robot.inputs import CommandTap, RobotInputs
 from edge.run.control_loop import CommandChain, ControlConfig, ControlLoop, ControlOutputs, ControlSources
 from edge.run.reasoning_loop import ReasoningLoop, ReasoningOutputs, ReasoningSchedule
-from edge.run.robot_inputs import CommandTap, RobotInputs
 from edge.safety.monitors.semantic import SemanticConfig
 from edge.safety.monitors.watch import Sources, Watch, WatchConfig
 from edge.safety.pre_arm import PreArm

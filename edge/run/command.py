@@ -37,7 +37,7 @@ from edge.live.options import add_live_arguments, live_options
 from edge.odometry.calibration import CalibrationError
 from edge.reasoning.generation_cycle import Mode
 from edge.reasoning.prompt import InstructionError
-from edge.run.arming import RefusedError, StoppedEarlyError
+from edge.robot.arming import RefusedError, StoppedEarlyError
 from edge.run.assembly import RunOptions
 from edge.run.instructions import check_first_instruction
 from edge.run.service import operator_lines

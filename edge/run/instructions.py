@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 from edge.live.feed import LiveFeed
 from edge.reasoning.prompt import InstructionError, check_instruction
-from edge.run.arming import RefusedError
+from edge.robot.arming import RefusedError
 from edge.run.stop_phrase import is_stop_phrase
 from firmware_bridge.core.config import RobotConfig
 from firmware_bridge.dds.shared_bus import SharedBus

@@ -10,10 +10,10 @@ from typing import Any
 from edge.artifacts.manifest import Artifacts
 from edge.core.stats import percentiles
 from edge.flightlog.recorder import Recorder
+from edge.robot.inputs import RobotInputs
 from edge.run.assembly import RunOptions
 from edge.run.control_loop import ControlLoop, ControlStatistics
 from edge.run.reasoning_loop import ReasoningLoop
-from edge.run.robot_inputs import RobotInputs
 from edge.state.switches import Switches
 from firmware_bridge.client import BridgeStatus
 from firmware_bridge.core.config import RobotConfig

@@ -24,11 +24,11 @@ from edge.inference.start_guard import WARM_UP_S
 from edge.inference.warm_up import check_tick, open_proven, warm_up
 from edge.reasoning.generation_cycle import Mode
 from edge.reasoning.prompt import InstructionError
-from edge.run.arming import POLL_S, RefusedError, StoppedEarlyError, arm, disarm
+from edge.robot.arming import POLL_S, RefusedError, StoppedEarlyError, arm, disarm
+from edge.robot.inputs import CommandTap, RobotInputs
 from edge.run.assembly import Engines, Loops, RunOptions, StopEvents, assemble
 from edge.run.instructions import InstructionChannels, open_channels
 from edge.run.result import close_log, run_record, run_result
-from edge.run.robot_inputs import CommandTap, RobotInputs
 from edge.run.service import ServiceReporter
 from edge.run.views import Views
 from edge.safety.faults.findings import Finding

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from edge.flightlog.recorder import Recorder
 from edge.live.feed import LiveFeed, Ros2Feed
 from edge.live.options import LiveError, LiveOptions
-from edge.run.arming import RefusedError
+from edge.robot.arming import RefusedError
 from firmware_bridge.core.config import RobotConfig
 
 

@@ -26,7 +26,7 @@ from edge.odometry.estimator import DriftEstimator
 from edge.odometry.gate import OdometryInputs
 from edge.odometry.visual_odometry import VisualOdometry, grey_frame
 from edge.reasoning.instruction_state import InstructionMemory, Job
-from edge.run.camera import decode_frame
+from edge.robot.camera import decode_frame
 from edge.state.pose_history import PoseHistory
 from edge.state.ring import EncodedFrame, TokenRing
 from edge.state.semantic import SemanticState

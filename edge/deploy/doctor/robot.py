@@ -8,10 +8,10 @@ from typing import Final, TypeVar
 
 import cv2
 
-from edge.cameras.newest import CameraSource
 from edge.deploy.doctor.check import Check, Level, skipped
-from edge.run.camera import decode_frame
-from edge.run.robot_reader import RobotReader, open_reader
+from edge.robot.camera import decode_frame
+from edge.robot.cameras.newest import CameraSource
+from edge.robot.reader import RobotReader, open_reader
 from firmware_bridge.backends import INSTALL
 from firmware_bridge.client import BridgeClient, BridgeUnavailable
 from firmware_bridge.core.config import OPERATOR_SUFFIX, RobotConfig

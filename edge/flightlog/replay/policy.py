@@ -19,7 +19,7 @@ from edge.inference.policy import Policy
 from edge.motion.controller import TARGET_TIME_S, Controller, ControllerConfig, ControllerInputs
 from edge.motion.recovery import MOVING
 from edge.reasoning.path_memory import PastPath, past_path_of
-from edge.run.camera import decode_frame
+from edge.robot.camera import decode_frame
 from edge.state.pose_history import PoseHistory, StampedPose
 from edge.state.reasoning_text import parse_waypoints
 from edge.state.ring import EncodedFrame

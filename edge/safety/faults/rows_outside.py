@@ -256,7 +256,7 @@ START: tuple[Fault, ...] = (
         "unsafe-robot", 58, Action.STOP, 0, "start",
         "The robot's own protection, such as a failsafe parameter, is weaker than the robot file requires.",
         "Correct on the robot what edge-bridge status names, then restart the bridge.",
-        "tests/edge/run/test_operator_arm.py::TestBridge::test_a_robot_whose_own_protection_is_weak_is_not_armed",
+        "tests/edge/robot/test_operator_arm.py::TestBridge::test_a_robot_whose_own_protection_is_weak_is_not_armed",
     ),
     Fault(
         "restart-storm", 59, Action.STOP, 0, "start",

@@ -9,7 +9,7 @@ _LOOP = "tests/edge/run/test_control_loop_faults.py::test_"
 _STOPPED = _LOOP + "the_robot_stops_in_time_and_drives_again_unless_the_fault_latches"
 _LIMITED = _LOOP + "the_speed_is_limited_in_time"
 _ONCE = _LOOP + "once_it_is_found_and_the_robot_drives_on"
-_ROBOT = "tests/edge/run/test_robot_inputs.py::test_"
+_ROBOT = "tests/edge/robot/test_inputs.py::test_"
 
 INPUTS: tuple[Fault, ...] = (
     Fault(

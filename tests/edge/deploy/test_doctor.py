@@ -26,7 +26,7 @@ from edge.deploy.doctor.graphs import Placement, guarded, judge_placement, judge
 from edge.deploy.doctor.robot import bridge, robot_link
 from edge.inference.graph import CPU_PROVIDER
 from edge.inference.start_guard import StartGuard
-from edge.run.robot_reader import RobotCamera
+from edge.robot.reader import RobotCamera
 from export.targets.file import load_target
 from firmware_bridge.core.config import RobotConfig, load_robot_config
 from firmware_bridge.core.link import BridgeStatus

@@ -21,7 +21,7 @@ from firmware_bridge.core.link import BridgeStatus
 from firmware_bridge.core.robot_state import BatteryState, CameraError, RobotState
 from tests.edge.deploy.test_doctor import jpeg
 from tests.edge.deploy.test_link_rights import robot as parts_of
-from tests.edge.run.test_robot_reader import robot_with
+from tests.edge.robot.test_reader import robot_with
 from tests.support.processes import GO2_SIM
 
 BITRATE_BPS = 500_000

@@ -27,7 +27,7 @@ from edge.motion.controller import Controller, ControllerConfig
 from edge.motion.recovery import BACKING_OFF, TURNING
 from edge.reasoning.decoding_rules import EITHER_WAY, DecodingContext, TextConstraint, TurnDistances
 from edge.reasoning.generation_cycle import Mode, ReasoningConfig
-from edge.run.camera import decode_frame
+from edge.robot.camera import decode_frame
 from edge.run.control_loop import CommandChain, ControlConfig, ControlLoop, ControlOutputs, ControlSources
 from edge.run.reasoning_loop import ReasoningLoop, ReasoningOutputs, ReasoningSchedule
 from edge.state.frame import Frame

@@ -15,9 +15,10 @@ from edge.inference.release import ReleaseDelay
 from edge.inference.scheduling import Role
 from edge.motion.controller import Controller, ControllerConfig
 from edge.reasoning.generation_cycle import Mode
-from edge.run import assembly, robot_inputs
+from edge.robot import inputs
+from edge.robot.inputs import RobotInputs
+from edge.run import assembly
 from edge.run.assembly import StopEvents
-from edge.run.robot_inputs import RobotInputs
 from edge.safety.monitors.watch import WatchConfig
 from edge.state.switches import Decoding, RecoverySwitch, Switches
 from firmware_bridge.core.config import RobotConfig, load_robot_config
@@ -92,9 +93,9 @@ def test_its_camera_height_and_angle_reach_visual_odometry(robot: RobotConfig, m
     seen: list[Any] = []
     reader = SimpleNamespace(set_state_listener=lambda _: None, close=lambda: None)
     source = SimpleNamespace(request_frame=None, captured_ns=None, close=lambda: None)
-    monkeypatch.setattr(robot_inputs, "open_reader", lambda *_: (reader, source))
-    monkeypatch.setattr(robot_inputs, "CameraPoller", lambda *_args, **_named: None)
-    monkeypatch.setattr(robot_inputs, "VisualOdometry", lambda geometry: seen.append(geometry))
+    monkeypatch.setattr(inputs, "open_reader", lambda *_: (reader, source))
+    monkeypatch.setattr(inputs, "CameraPoller", lambda *_args, **_named: None)
+    monkeypatch.setattr(inputs, "VisualOdometry", lambda geometry: seen.append(geometry))
     RobotInputs(robot, image_px=32, period_ns=10**8, commanded=lambda: None, say=print, on_death=print)
     assert robot.mount is not None
     assert [(one.height_m, one.forward_m) for one in seen] == [(robot.mount.height_m, robot.mount.forward_m)]

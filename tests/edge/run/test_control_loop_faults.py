@@ -2,7 +2,7 @@
 
 What is judged is the command that leaves the loop: zero (or half speed) within the fault's bound less what the bridge
 needs to put it on the wire. `edge/safety/faults/table.py` names the case of each fault; faults that odometry finds are
-injected in `test_robot_inputs.py`.
+injected in `test_inputs.py`.
 """
 
 from __future__ import annotations

@@ -19,9 +19,9 @@ from edge.inference.release import ReleaseDelay
 from edge.inference.scheduling import Role
 from edge.inference.warm_up import WarmUp
 from edge.reasoning.generation_cycle import Mode
+from edge.robot.arming import RefusedError, StoppedEarlyError
 from edge.run import assembly
 from edge.run import session as module
-from edge.run.arming import RefusedError, StoppedEarlyError
 from edge.run.assembly import Loops, RunOptions, StopEvents
 from edge.run.session import RunSession
 from edge.safety.watchdog import Hang

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from edge.deploy.install import main as install_main
 from edge.reasoning.prompt import InstructionError
-from edge.run.arming import disarm
+from edge.robot.arming import disarm
 from edge.run.command import main as run_main
 from edge.run.instructions import InstructionSocket, check_first_instruction
 from edge.run.stop_phrase import COMPANIONS, STOP_WORDS, is_stop_phrase

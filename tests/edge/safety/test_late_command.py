@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.run.robot_inputs import CommandTap
+from edge.robot.inputs import CommandTap
 from edge.safety.late_command import HOLD_NS, LATE_NS, REPEAT_NS, LateCommand, hold_while_late
 from firmware_bridge.core.config import BridgeConfig
 

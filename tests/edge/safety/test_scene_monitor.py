@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from edge.core.geometry import SE2
-from edge.run.camera import Frame
+from edge.robot.camera import Frame
 from edge.safety.monitors.frame import CONTENTS_KEPT, FrameConfig, FrameMonitor
 from edge.safety.monitors.scene import SceneConfig, SceneMonitor, expected_change
 

@@ -12,7 +12,7 @@ import pytest
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
 from cyclonedds.qos import Policy
 
-from edge.cameras.ros2 import Ros2Camera
+from edge.robot.cameras.ros2 import Ros2Camera
 from edge.run.ros2_instructions import Ros2Instructions
 from firmware_bridge.core.config import DdsConfig
 from firmware_bridge.core.robot_state import DdsError

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from edge.core.geometry import SE2
-from edge.run.robot_reader import RobotReader
+from edge.robot.reader import RobotReader
 from firmware_bridge.client import BridgeClient, BridgeUnavailable
 from firmware_bridge.core.config import RobotConfig, load_robot_config
 from firmware_bridge.state_client import StateReader

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 import pytest
 
-from edge.cameras import video_capture
-from edge.cameras.video_capture import Capture, VideoCaptureCamera, checked, open_capture
-from edge.run.camera import decode_frame
+from edge.robot.camera import decode_frame
+from edge.robot.cameras import video_capture
+from edge.robot.cameras.video_capture import Capture, VideoCaptureCamera, checked, open_capture
 from firmware_bridge.core.robot_state import CameraError
 
 LATENCY_NS = 30_000_000

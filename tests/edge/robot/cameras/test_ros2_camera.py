@@ -13,9 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge.cameras.ros2 import Ros2Camera
-from edge.cameras.ros2_pictures import compressed_picture, raw_picture
-from edge.run.camera import decode_frame
+from edge.robot.camera import decode_frame
+from edge.robot.cameras.ros2 import Ros2Camera
+from edge.robot.cameras.ros2_pictures import compressed_picture, raw_picture
 from firmware_bridge.core.config import ConfigError, DdsConfig
 from firmware_bridge.core.robot_state import CameraError
 from firmware_bridge.dds import bus as bus_module

@@ -10,11 +10,11 @@ from contextlib import closing, suppress
 
 import pytest
 
-from edge.cameras import mjpeg
-from edge.cameras.mjpeg import MjpegCamera
+from edge.robot.cameras import mjpeg
+from edge.robot.cameras.mjpeg import MjpegCamera
 from firmware_bridge.core.robot_state import CameraError
 from sim_hil.protocols.camera_stream import CameraServer, Shutter, listen
-from tests.edge.cameras.test_multipart import HEAD, JPEG_A, JPEG_B, part
+from tests.edge.robot.cameras.test_multipart import HEAD, JPEG_A, JPEG_B, part
 
 LATENCY_NS = 40_000_000
 pytestmark = pytest.mark.process

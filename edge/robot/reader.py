@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
-from edge.cameras.mjpeg import MjpegCamera
-from edge.cameras.newest import CameraSource
-from edge.cameras.video_capture import VideoCaptureCamera
+from edge.robot.cameras.mjpeg import MjpegCamera
+from edge.robot.cameras.newest import CameraSource
+from edge.robot.cameras.video_capture import VideoCaptureCamera
 from firmware_bridge.core.config import RobotConfig
 from firmware_bridge.core.robot_state import BatteryState, RobotState
 from firmware_bridge.dds.shared_bus import SharedBus
@@ -78,7 +78,7 @@ def open_camera(robot: RobotConfig, bus: SharedBus | None = None) -> CameraSourc
     if kind in ("v4l2", "gstreamer"):
         return VideoCaptureCamera(kind, address, latency_ns=latency_ns)
     if kind in ("ros2", "ros2raw"):
-        from edge.cameras.ros2 import Ros2Camera  # needs the extra of its protocol
+        from edge.robot.cameras.ros2 import Ros2Camera  # needs the extra of its protocol
 
         reliable = robot.ros2 is not None and robot.ros2.reliable_inputs
         return Ros2Camera(

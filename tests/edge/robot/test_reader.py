@@ -13,19 +13,19 @@ from typing import Any
 
 import pytest
 
-from edge.cameras.mjpeg import MjpegCamera
-from edge.cameras.newest import CameraSource
-from edge.cameras.ros2 import Ros2Camera
-from edge.cameras.video_capture import VideoCaptureCamera
-from edge.run.robot_inputs import RobotInputs
-from edge.run.robot_reader import open_camera, open_reader
+from edge.robot.cameras.mjpeg import MjpegCamera
+from edge.robot.cameras.newest import CameraSource
+from edge.robot.cameras.ros2 import Ros2Camera
+from edge.robot.cameras.video_capture import VideoCaptureCamera
+from edge.robot.inputs import RobotInputs
+from edge.robot.reader import open_camera, open_reader
 from firmware_bridge.client_link import ClientLink
 from firmware_bridge.core.config import OBSERVER_SUFFIX, RobotConfig, Ros2Config, load_robot_config
 from firmware_bridge.core.robot_state import BatteryState, CameraError, RobotState
 from firmware_bridge.dds.shared_bus import SharedBus
 from firmware_bridge.state_client import StateReader
 from sim_hil.protocols.camera_stream import CameraServer, Shutter, listen
-from tests.edge.run.test_camera_poller import jpeg
+from tests.edge.robot.test_camera_poller import jpeg
 from tests.support.processes import GO2_SIM
 
 MS = 1_000_000

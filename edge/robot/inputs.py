@@ -23,8 +23,8 @@ from edge.odometry.camera_geometry import Attitude, CameraGeometry
 from edge.odometry.estimator import DriftEstimator, OdometryOutputs
 from edge.odometry.gate import OdometryInputs
 from edge.odometry.visual_odometry import VisualOdometry, grey_frame
-from edge.run.camera import CameraPoller
-from edge.run.robot_reader import open_reader
+from edge.robot.camera import CameraPoller
+from edge.robot.reader import open_reader
 from edge.safety.faults.findings import FindingQueue
 from edge.safety.late_command import HOLD_NS, REPEAT_NS
 from edge.safety.monitors.robot import LinkMonitor

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.cameras.newest import Backoff, NewestPicture, ReceivingThread
 from edge.core.jpeg import MAX_PX
+from edge.robot.cameras.newest import Backoff, NewestPicture, ReceivingThread
 from firmware_bridge.core.robot_state import CameraError
 
 _QUALITY: Final = 92

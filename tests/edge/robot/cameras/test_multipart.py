@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.cameras.multipart import MAX_BETWEEN_BYTES, MAX_HEAD_BYTES, MjpegParser, Part, StreamError
 from edge.core.jpeg import MAX_BYTES
+from edge.robot.cameras.multipart import MAX_BETWEEN_BYTES, MAX_HEAD_BYTES, MjpegParser, Part, StreamError
 
 HEAD = b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=frame\r\n\r\n"
 JPEG_A, JPEG_B = b"\xff\xd8 first \r\n--fram \xff\xd9", b"\xff\xd8 second \xff\xd9"

@@ -9,8 +9,8 @@ import time
 from typing import Final
 from urllib.parse import urlsplit
 
-from edge.cameras.multipart import MjpegParser, StreamError
-from edge.cameras.newest import Backoff, NewestPicture, ReceivingThread
+from edge.robot.cameras.multipart import MjpegParser, StreamError
+from edge.robot.cameras.newest import Backoff, NewestPicture, ReceivingThread
 from firmware_bridge.core.robot_state import CameraError
 
 STALL_NS: Final = 3_000_000_000

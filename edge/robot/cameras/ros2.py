@@ -6,8 +6,8 @@ import threading
 import time
 from typing import Final
 
-from edge.cameras.newest import Backoff, NewestPicture, ReceivingThread
-from edge.cameras.ros2_pictures import compressed_picture, raw_picture
+from edge.robot.cameras.newest import Backoff, NewestPicture, ReceivingThread
+from edge.robot.cameras.ros2_pictures import compressed_picture, raw_picture
 from firmware_bridge.core.config_ros2 import check_topic_name, dds_topic
 from firmware_bridge.core.robot_state import CameraError, DdsError
 from firmware_bridge.core.sections import DdsConfig

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from edge.odometry.camera_geometry import Attitude
-from edge.run import robot_inputs
-from edge.run.robot_inputs import RobotInputs
+from edge.robot import inputs
+from edge.robot.inputs import RobotInputs
 from edge.safety.faults.table import FAULTS
 from edge.state.frame import Frame
 from firmware_bridge.core.config import load_robot_config
@@ -59,7 +59,7 @@ class Rig:
         self.bench = Bench()
         self.deaths: list[str] = []
         monkeypatch.setattr("firmware_bridge.unitree.client.Go2Reader", FakeReader)
-        monkeypatch.setattr(robot_inputs, "time", SimpleNamespace(monotonic_ns=lambda: self.bench.now_ns))
+        monkeypatch.setattr(inputs, "time", SimpleNamespace(monotonic_ns=lambda: self.bench.now_ns))
         self.inputs = RobotInputs(
             load_robot_config(GO2_SIM), image_px=32, period_ns=PERIOD_NS, commanded=lambda: self.command,
             say=self.deaths.append, on_death=self.deaths.append,
@@ -286,8 +286,8 @@ def test_a_picture_is_seen_with_the_attitude_of_its_own_instant(monkeypatch: pyt
     seen: list[Attitude] = []
     eye = SimpleNamespace(step=lambda grey, stamp_ns, attitude: seen.append(attitude))
     poller: dict[str, Callable[[Frame], None]] = {}
-    monkeypatch.setattr(robot_inputs, "VisualOdometry", lambda _geometry: eye)
-    monkeypatch.setattr(robot_inputs, "CameraPoller", lambda _request, **named: poller.update(see=named["on_frame"]))
+    monkeypatch.setattr(inputs, "VisualOdometry", lambda _geometry: eye)
+    monkeypatch.setattr(inputs, "CameraPoller", lambda _request, **named: poller.update(see=named["on_frame"]))
     rig = Rig(monkeypatch)
     began_ns = rig.bench.now_ns
     rig.alter = lambda state: replace(state, pitch_rad=(state.received_ns - began_ns) / 1e9)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from edge.odometry.visual_odometry import grey_frame
-from edge.run.camera import CameraPoller, decode_frame
+from edge.robot.camera import CameraPoller, decode_frame
 from edge.state.frame import fit_frame
 from firmware_bridge.core.robot_state import CameraError
 

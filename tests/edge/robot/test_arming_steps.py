@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from edge.run.arming import RefusedError, arm, disarm
+from edge.robot.arming import RefusedError, arm, disarm
 from firmware_bridge.client import BridgeStatus, BridgeUnavailable
 
 MS = 1_000_000

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import pytest
 
-from edge.run.arming import ARMING, WAITING, RefusedError, StoppedEarlyError, arm
+from edge.robot.arming import ARMING, WAITING, RefusedError, StoppedEarlyError, arm
 from firmware_bridge.core.link import Arm, BridgeStatus, Stop
 from firmware_bridge.unitree.messages import ids
 from tests.support.robot.bridge_bench import MS, SAFETY, Bench

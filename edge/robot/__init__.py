@@ -1,0 +1,1 @@
+"""What belongs to the robot: its camera, its states as inputs of a run, and arming it through the bridge."""
