@@ -29,7 +29,7 @@ RULE_ERRORS: Final = (ValueError, LookupError, TypeError, AttributeError, Arithm
 def general_reason(decisive: Explanation) -> str:
     """Return the verdict's sentence without the name of the object, so that equal failures count together."""
     event, because = decisive.event, decisive.verdict.because
-    return because.replace(event.detail, "an object") if event.kind == "collision" else because
+    return because.replace(f"into {event.detail}", "into an object") if event.kind == "collision" else because
 
 
 def keep_cause(flight: Path, folder: Path) -> None:

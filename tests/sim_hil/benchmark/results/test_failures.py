@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 
 from edge.core.geometry import SE2
+from edge.flightlog.explain.events import COLLISION, Event
+from edge.flightlog.explain.explanation import Explanation
 from edge.flightlog.explain.flight import read_flight
+from edge.flightlog.explain.verdict import Verdict
 from edge.flightlog.standard_messages import jpeg_size
 from sim_hil.benchmark.env.metrics import Outcome
 from sim_hil.benchmark.results import causes as causes_of
@@ -48,6 +51,18 @@ def test_failures_are_counted_by_cause(run: Path) -> None:
     rows = cause_table(found).rows
     assert [tuple(row)[2:5] for row in rows] == [("2", "0", "67"), ("0", "1", "33")]
     assert rows[0][1] == "the plan drives, the command does not: camera-frozen"
+
+
+@pytest.mark.parametrize(
+    ("touched", "because", "general"),
+    [
+        ("plant 3", "the plan led into plant 3", "the plan led into an object"),
+        ("person", "the person came after the picture", "the person came after the picture"),
+    ],
+)
+def test_a_general_reason_names_no_object_and_keeps_the_person(touched: str, because: str, general: str) -> None:
+    event, verdict = Event(COLLISION, 0, 0, touched), Verdict("action expert", because, ())
+    assert causes_of.general_reason(Explanation(event, verdict, False, 0.0, (), "", None, None, None)) == general
 
 
 @pytest.mark.slow
