@@ -126,6 +126,13 @@ def test_importing_it_pulls_in_neither_torch_nor_pybullet(module: str) -> None:
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
+@pytest.mark.parametrize("module", ["tools.train.collect.worker", "tools.train.encoder.worker"])
+def test_a_worker_that_draws_pictures_starts_without_torch(module: str) -> None:
+    """A new process records every layout: torch's import takes as long as a tour."""
+    code = f"import {module}, sys; sys.exit('torch' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
 SLOW_IMPORTS = [pytest.param(name, marks=pytest.mark.slow) for name in ("export.evaluation.gates", "tools.bench.tick")]
 
 

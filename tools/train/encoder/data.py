@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +30,10 @@ from tools.train.config.collect import CORRIDOR, OUTDOORS
 from tools.train.config.encoder import OUTDOORS_LEAST, FramesConfig
 from tools.train.drives.drive import file_sha256
 from tools.train.encoder.labels import CLASSES, COLOUR_WORDS, OPENINGS, PIXELS, label_shapes
-from tools.train.run.job import StageProgress
 from tools.train.samples.augment import Picture, decoded
+
+if TYPE_CHECKING:  # workers that draw pictures start without torch, whose import takes as long as a tour
+    from tools.train.run.job import StageProgress
 
 FORMAT: Final = 2
 WORKER: Final = "tools.train.encoder.worker"

@@ -8,6 +8,7 @@ valid, and its visual tokens have noise.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -18,7 +19,9 @@ from edge.reasoning.path_memory import prompt_point
 from tools.train.config.encoder import AugmentConfig
 from tools.train.config.sft import AROUND, ShowConfig
 from tools.train.samples.anchors import Anchor, frames_at
-from tools.train.samples.language_batch import Halves
+
+if TYPE_CHECKING:  # workers that draw pictures start without torch
+    from tools.train.samples.language_batch import Halves
 
 Picture = NDArray[np.uint8]
 
