@@ -39,6 +39,8 @@ EXPERT_PREFIX: Final = "e"
 _TAG: Final = 0xC0
 _MOST_DROPPED: Final = 0.5
 """Share of unusable drives above which the recording fails: the cause lies outside single drives."""
+_PER_PROCESS: Final = 8
+"""Drives of small layouts that one process records: its start costs as much processor time as half a tour."""
 BETA: Final = 0.5
 """Share of the expert's commands in round 1; each later round has half of the previous one's."""
 _EXPERT_TURNS: Final = 1_000
@@ -58,16 +60,17 @@ class Collection:
     tour: TourConfig | None = None
 
     def orders(self, folder: Path, has: Callable[[str], bool]) -> list[Order]:
-        """Return one order for each layout that lacks a drive; `has` tells which drives are done."""
+        """Return orders of whole layouts for all missing drives; `has` tells which drives are done."""
         rng = np.random.default_rng((self.seed, self.turn, _TAG))
         scenario_seed, draw_seed = int(rng.integers(MAX_SEED + 1)), int(rng.integers(2**31))
         if scenario_seed in KEPT_SEEDS:
             scenario_seed -= len(KEPT_SEEDS)
         # An order does not contain `jobs`: their number must not change the drives.
         config = replace(self.config, jobs=0)
-        orders, size = [], config.drives_per_layout if self.tour is None else self.tour.per_layout
+        orders, layout = [], config.drives_per_layout if self.tour is None else self.tour.per_layout
+        size = layout * max(1, _PER_PROCESS // layout)
         for start in range(0, self.count, size):
-            # Always a whole layout, so that its tasks do not depend on the count.
+            # Always whole layouts, so that their tasks do not depend on the count.
             order = Order(
                 str(folder), self.prefix, draw_seed, scenario_seed, start, size, (), config, self.policy, self.tour
             )
@@ -136,7 +139,7 @@ class _UnderWay:
             raise StageFailedError(str(message.get("refused", f"a worker sent {message}")))
 
     def _repeat(self, order: Order, begun: str, failure: str) -> None:
-        """A process has died: drop the drive that it had begun and order the rest of its layout again."""
+        """A process has died: drop the drive that it had begun and order the rest again."""
         if not begun:
             raise StageFailedError(f"the process of drive {order.id(order.start)} and those after it {failure}")
         if not self._writer.has(begun):

@@ -1,4 +1,4 @@
-"""The worker process that records drives or tours of one layout, one after the other, each in a new simulation.
+"""The worker process that records drives or tours of one or more layouts, one after the other.
 
 A drive's random numbers depend on the collection's seed and the drive's number alone.
 """
@@ -50,7 +50,8 @@ _PLAN_STEP: Final = 3 * RATE_HZ - 1  # index of the planned pose in 3 s
 class Order:
     """Job of one process: record drives `start` to `start + count - 1` into `folder`, except those in `skip`.
 
-    `policy`: artifacts that drive, and their options; None if the expert drives. `tour`: record tours instead.
+    `start` is a layout's first drive. `policy`: artifacts that drive, and their options; None if the expert drives.
+    `tour`: record tours instead.
     """
 
     folder: str
@@ -102,14 +103,25 @@ def messages(job: Message) -> Iterator[Mapping[str, Any]]:
     `{"refused": …}` ends the order: the policy's artifacts cannot be used.
     """
     order = build(Order, job, "order")
-    numbers = range(order.start, order.start + order.count)
     size = order.tour.per_layout if order.tour is not None else order.config.drives_per_layout
+    if order.start % size:
+        raise ValueError("an order begins with a layout's first drive")
+    end = order.start + order.count
+    for start in range(order.start, end, size):
+        numbers = range(start, min(start + size, end))
+        if any(order.id(number) not in order.skip for number in numbers):
+            for message in _of_layout(order, numbers, size):
+                yield message
+                if "refused" in message:
+                    return
+
+
+def _of_layout(order: Order, numbers: range, size: int) -> Iterator[Mapping[str, Any]]:
+    """Record some of the `size` drives of one layout; yield the messages of each."""
     kinds = order.config.kinds or SHARES
-    if order.start // size != numbers[-1] // size:
-        raise ValueError("an order is of one layout")
     try:
         scenarios = list(
-            training_episodes(order.scenario_seed, order.count, kinds, start=order.start, tasks_per_scene=size)
+            training_episodes(order.scenario_seed, len(numbers), kinds, start=numbers[0], tasks_per_scene=size)
         )
     except ScenarioError:
         for number in numbers:

@@ -161,6 +161,13 @@ def test_no_process_is_left_behind(tmp_path: Path, faulty: Faulty, monkeypatch: 
 # -- orders and draws -------------------------------------------------------------------------------------------------
 
 
+def test_one_process_records_several_small_layouts() -> None:
+    small = Collection("e", COUNT, 3, 0, CollectConfig(episodes=COUNT, drives_per_layout=2))
+    first, second = small.orders(Path("folder"), lambda _: False)
+    assert (first.start, first.count, first.skip) == (0, 8, ())
+    assert (second.start, second.skip) == (8, tuple(f"e{number:05d}" for number in range(10, 16)))
+
+
 @pytest.mark.slow
 def test_layouts_of_evaluation_and_reinforcement_learning_are_not_collected() -> None:
     found = {

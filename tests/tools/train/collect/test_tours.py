@@ -21,7 +21,7 @@ from tests.support.train.training_scenarios import progress_of, scenarios
 from tools.train.collect.collection import Collection, build_tours, tour_anchors
 from tools.train.collect.record import CameraSettings, Recorded
 from tools.train.collect.tour_world import KinematicBase, TourWorld, record_tour
-from tools.train.collect.worker import messages
+from tools.train.collect.worker import Order, messages
 from tools.train.config.checks import TrainError
 from tools.train.config.collect import CollectConfig, TourConfig
 from tools.train.drives.drive import TOUR_DRIVER, Dataset, Drive
@@ -162,6 +162,23 @@ def test_its_process_writes_a_drive_that_can_be_read_in_seconds(tmp_path: Path) 
     assert np.array_equal(Seconds(drive, True).frame(1), drive.frame(10)[:, ::-1])
     with pytest.raises(TrainError, match="frame 7 has no image"):
         drive.frame(7)
+
+
+@pytest.mark.slow
+def test_a_process_of_several_layouts_records_what_a_process_of_each_would(tmp_path: Path) -> None:
+    (tmp_path / "drives").mkdir()
+    tour = TourConfig(count=4, per_layout=1, people_most=2)
+    first = Collection("w", 3, 3, 0, CollectConfig(), tour=tour).orders(tmp_path, lambda drive_id: drive_id == "w00001")
+    assert len(first) == 1
+
+    def recorded(order: Order) -> list[Any]:
+        return [message["drive"] for message in messages(plain(order)) if "drive" in message]
+
+    alone = [replace(first[0], start=number, count=1, skip=()) for number in (0, 2)]
+    together = recorded(first[0])
+    assert [entry["id"] for entry in together] == ["w00000", "w00002"]
+    assert len({entry["layout_seed"] for entry in together}) == 2
+    assert together == [entry for order in alone for entry in recorded(order)]
 
 
 def test_seconds_with_a_person_in_the_path_are_left_out(tmp_path: Path) -> None:
