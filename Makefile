@@ -9,26 +9,20 @@ PEOPLE ?= 4
 DURATION ?= 60
 ROBOT ?= go2
 
-# Tests: two at a time with one thread each where they are isolated, one at a time where they start real-time processes.
+# Isolated tests run two at a time with one thread each; tests that start real-time processes run one at a time.
 WORKERS ?= 2
 PYTEST := $(BIN)/python -m pytest
 PARALLEL := OMP_NUM_THREADS=1 $(PYTEST) -n $(WORKERS) --dist loadfile
 PROCESS_FILES = $(shell grep -rlF --include='test_*.py' mark.process tests)
-# Both kinds of test share a folder, so that the model is exported once. $(1): the tests' name, $(2): options, $(3): marker.
-tiers = @folder=$$(mktemp -d) && trap 'rm -rf "$$folder"' EXIT && export EDGE_TEST_FOLDER="$$folder" && \
-	echo "== $(1) tests, $(WORKERS) at a time" && \
-	$(PARALLEL) $(2) -m "$(3)not process" && \
-	echo "== $(1) tests of processes, one at a time" && \
-	$(PYTEST) $(2) -m "$(3)process and not repeated" $(PROCESS_FILES)
-# Both kinds beside each other, the isolated ones at the lowest priority: fast tests of processes mostly wait. Slow ones
-# drive robots in real time and need the processor.
-fast_tiers = @folder=$$(mktemp -d) && export EDGE_TEST_FOLDER="$$folder" && \
+# Both kinds run beside each other, because tests of processes mostly wait; the isolated ones have the lowest priority.
+# They share a folder, so that the model is exported once. $(1): the tests' name, $(2): options, $(3): marker.
+tiers = @folder=$$(mktemp -d) && export EDGE_TEST_FOLDER="$$folder" && \
 	trap 'kill $$isolated 2>/dev/null; wait $$isolated; rm -rf "$$folder"' EXIT && \
-	{ nice -n 19 env $(PARALLEL) -m "not slow and not process" > "$$folder/isolated.log" 2>&1 & } && isolated=$$!; \
-	echo "== fast tests of processes, one at a time" && \
-	{ $(PYTEST) -m "not slow and process and not repeated" $(PROCESS_FILES); processes=$$?; } ; \
+	{ nice -n 19 env $(PARALLEL) $(2) -m "$(3)not process" > "$$folder/isolated.log" 2>&1 & } && isolated=$$!; \
+	echo "== $(1) tests of processes, one at a time" && \
+	{ $(PYTEST) $(2) -m "$(3)process and not repeated" $(PROCESS_FILES); processes=$$?; } ; \
 	wait $$isolated; code=$$?; isolated=; \
-	echo "== fast tests, $(WORKERS) at a time" && cat "$$folder/isolated.log" && test $$processes = 0 && test $$code = 0
+	echo "== $(1) tests, $(WORKERS) at a time" && cat "$$folder/isolated.log" && test $$processes = 0 && test $$code = 0
 # Tests start hundreds of processes; without compiled modules on the disk each would compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
@@ -107,7 +101,7 @@ lint: .venv/.test-installed
 	$(BIN)/mypy
 
 test: lint
-	$(fast_tiers)
+	$(call tiers,fast,,not slow and )
 
 test-slow: .venv/.test-installed
 	$(call tiers,slow,--durations=15,slow and )
