@@ -151,7 +151,11 @@ class LanguageModel:
 
     def constraint(self, context: DecodingContext) -> TextConstraint:
         """Return the constraint of one generation's text by a context."""
-        return TextConstraint(context, lambda text: self.tokenizer.encode(text, add_special_tokens=False).ids)
+        return TextConstraint(context, self.encode)
+
+    def encode(self, text: str) -> list[int]:
+        """Return the tokens of a text."""
+        return self.tokenizer.encode(text, add_special_tokens=False).ids
 
     def generate(
         self,
@@ -192,7 +196,7 @@ class LanguageModel:
             [EncodedFrame(i, here, tokens) for i, tokens in zip(frames, noise, strict=True)],
             "stop", EXAMPLE_PAST_PATH, EXAMPLE_BEFORE,
         )  # fmt: skip
-        first = self.tokenizer.encode(FIRST_TEXT, add_special_tokens=False).ids
+        first = self.encode(FIRST_TEXT)
         written = self.generate(prompt, max_new_tokens=MOST_ROWS, cancelled=lambda: False)
         call = Call(self._graphs[-1], self._buffers, with_logits=True)
         usual = exact_calls_ns(call, self._kv, written.prompt_tokens, first[:MOST_ROWS])
@@ -215,7 +219,7 @@ class LanguageModel:
 
     def guess_for(self, call_ns: Mapping[int, float]) -> None:
         """Forget earlier texts, and guess for a device with these durations of a call by its number of rows, ns."""
-        first = self.tokenizer.encode(FIRST_TEXT, add_special_tokens=False).ids
+        first = self.encode(FIRST_TEXT)
         is_number = lru_cache(KNOWN_TOKENS)(lambda token: any(map(str.isdigit, self.text_of([token]))))
         self.speculator = Speculator(first, call_ns, self.ends_line, is_number)
 

@@ -3,10 +3,11 @@
     python -m tools.bench.runtimes --artifacts DIR --out out/bench/runtimes --peers-venv DIR
 
 Shapes at full size: one 448² frame → 256 visual tokens; prefill of 1,100 tokens (ours: four frames' embeddings and 76
-text tokens; the peers: 1,100 ids, without the gather); then 32 decoded tokens; the action expert over 256 visual and
-1,132 semantic tokens. Ours runs the split step, the peers the whole action expert. Each contender is a process pinned
-to the same cores; in each round every contender runs once while the others idle. Memory is that of a new process that
-opens its parts and computes each task once.
+text tokens; the peers: 1,100 ids, without the gather); then 80 decoded tokens; the action expert over 256 visual and
+1,180 semantic tokens. Ours runs the split step, the peers the whole action expert. A generation of ours is the
+runner's, with guesses: each round writes another text of `peers/answers.json`, recorded in a drive. Each contender is a
+process pinned to the same cores; in each round every contender runs once while the others idle. Memory is that of a new
+process that opens its parts and computes each task once.
 
 Writes samples.json, summary.md and the workers' logs. Exit code 0 when every bar that could be compared is reached, 1
 when one is not, 2 for bad input.

@@ -20,7 +20,7 @@ import json
 import statistics
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -34,9 +34,8 @@ from edge.core.geometry import SE2
 from edge.inference.calls import Floats
 from edge.inference.language import Generation, LanguageModel
 from edge.inference.latency_profile import LatencyProfile
-from edge.reasoning.decoding_rules import DecodingContext, Line, TextConstraint, TurnDistances
+from edge.reasoning.decoding_rules import DecodingContext, TextConstraint
 from edge.reasoning.prompt import EXAMPLE_BEFORE, EXAMPLE_PAST_PATH, Segment
-from edge.state.reasoning_text import Progress
 from edge.state.ring import EncodedFrame
 from edge.state.switches import Decoding, SwitchOptions
 from sim_hil.benchmark.arguments import choose
@@ -45,6 +44,7 @@ from sim_hil.benchmark.policies.artifacts_policy import ArtifactsPolicy
 from sim_hil.benchmark.policies.select import robot_config
 from sim_hil.benchmark.suite.episode import Episode, SuiteError, load_suite
 from tools.bench import bad_input, command_parser
+from tools.bench.peers.forced_text import ForcedText, context_of
 
 VARIANTS = ("single", "plain", "guessing")
 INSTRUCTION = "walk down the corridor, pass the vending machine and stop at the second door on the left"
@@ -203,7 +203,7 @@ class Prompts:
                     Segment(tuple(part["ids"]), None if part["frame"] is None else frames[part["frame"]])
                     for part in record["segments"]
                 ]
-                context, most = _context(record["rules"]), int(record["max_new_tokens"])
+                context, most = context_of(record["rules"]), int(record["max_new_tokens"])
                 variants.decode(
                     lambda model, segments=segments, context=context, most=most: model.generate(  # type: ignore[misc]
                         segments, max_new_tokens=most, cancelled=lambda: False, constraint=model.constraint(context)
@@ -211,28 +211,6 @@ class Prompts:
                 )
         except (ValueError, KeyError, TypeError, IndexError) as error:
             raise ArtifactError(f"{path}: expected prompts that --save wrote ({error!r})") from error
-
-
-def _context(rules: Mapping[str, Any]) -> DecodingContext:
-    before = None if rules["before"] is None else Progress(**rules["before"])
-    turn = None if rules["turn"] is None else TurnDistances(rules["turn"], tuple(rules["turn_left_m"]))
-    return DecodingContext(before, rules["follow"], turn, rules["turn_may_be_done"])
-
-
-class _ForcedText:
-    """A constraint that replaces every choice by the token of a given text."""
-
-    def __init__(self, tokens: Sequence[int], end: int) -> None:
-        self._tokens = iter((*tokens, end))
-
-    def choose(self, token: int) -> int:
-        return next(self._tokens)
-
-    def forced(self) -> Line:
-        return ()
-
-    def replace_line(self, line: str) -> Line | None:
-        return None
 
 
 def drive(variants: Variants, artifacts: Path, episodes: Sequence[Episode], decoding: str, save: Path | None) -> None:
@@ -264,10 +242,10 @@ def force(variants: Variants, texts: Sequence[str], rounds: int) -> None:
     segments = plain.prompt.build(frames, INSTRUCTION, EXAMPLE_PAST_PATH, EXAMPLE_BEFORE)
     end = plain.runtime.im_end_id
     for text in [text for _ in range(rounds) for text in texts]:
-        tokens = plain.tokenizer.encode(text, add_special_tokens=False).ids
+        tokens = plain.encode(text)
 
         def work(model: LanguageModel, tokens: Sequence[int] = tokens) -> Generation:
-            rules = cast("TextConstraint", _ForcedText(tokens, end))
+            rules = ForcedText(tokens, end, plain.encode)
             limit = len(tokens) + 1
             return model.generate(segments, max_new_tokens=limit, cancelled=lambda: False, constraint=rules)
 

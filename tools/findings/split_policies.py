@@ -212,9 +212,7 @@ class _TruthfulLanguage(LanguageModel):
         forced, end_id = self.variant.forced_text, self.runtime.im_end_id
         if forced is None or self.truth is None:
             return super().constraint(context)
-        return forced(
-            context, lambda text: self.tokenizer.encode(text, add_special_tokens=False).ids, self.truth, end_id
-        )
+        return forced(context, self.encode, self.truth, end_id)
 
 
 class SplitPolicy(ArtifactsPolicy):

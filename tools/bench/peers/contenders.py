@@ -135,6 +135,7 @@ METRICS = (
     Metric("encoder_ms", "encoder, one frame", "ms", False, 1.0),
     Metric("prefill_ms", "prefill", "ms", False, 1.1),
     Metric("decode_tokens_per_s", "decode", "tok/s", True, 1.8),
+    Metric("generation_ms", "generation: prefill and 80 tokens", "ms", False, 2.0),
     Metric("action_ms", "action expert, one step", "ms", False, 2.0, against_own_stack=True),
     Metric("tick_ms", "control tick (encoder + action)", "ms", False, None),
     Metric("language_rss_mb", "peak memory, language model (RSS)", "MB", False, 1.0),

@@ -14,7 +14,7 @@ import numpy as np
 import openvino as ov
 from numpy.typing import NDArray
 
-from tools.bench.peers.workers.serve import Load, Task, language_task, serve, timed_task
+from tools.bench.peers.workers.serve import Load, Task, generation, language_task, serve, timed_task
 from tools.bench.peers.workload import DECODE_STEPS, Workload
 
 
@@ -115,7 +115,7 @@ def load_genai(request: Load) -> Mapping[str, Task]:
         if len(made.tokens[0]) != DECODE_STEPS + 1:
             raise ValueError(f"{len(made.tokens[0])} tokens generated, expected {DECODE_STEPS + 1}")
         times = made.perf_metrics
-        return {"prefill_ms": times.get_ttft().mean, "decode_tokens_per_s": 1e3 / times.get_tpot().mean}
+        return generation(times.get_ttft().mean, DECODE_STEPS * times.get_tpot().mean, DECODE_STEPS)
 
     return {"language": run}
 

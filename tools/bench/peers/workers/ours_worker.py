@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
+import json
 import sys
+import time
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -14,10 +18,13 @@ from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
 from edge.reasoning.prompt import Segment
 from edge.state.semantic import SemanticState
-from tools.bench.peers.workers.serve import Load, Task, serve, timed_task
+from tools.bench.peers.forced_text import ForcedText, context_of
+from tools.bench.peers.workers.serve import Load, Task, generation, serve, timed_task
 from tools.bench.peers.workload import DECODE_STEPS, FRAMES, Workload
 
 HERE = SE2(0.0, 0.0, 0.0)
+ANSWERS: Final = Path(__file__).parents[1] / "answers.json"
+"""Texts of one drive, one in 3 s, with the rules that they were decoded with."""
 
 
 def prompt(workload: Workload, artifacts: Artifacts) -> list[Segment]:
@@ -30,18 +37,40 @@ def prompt(workload: Workload, artifacts: Artifacts) -> list[Segment]:
 
 
 def language(workload: Workload, artifacts: Artifacts, threads: int) -> Task:
-    """Create the task of one generation of exactly DECODE_STEPS tokens."""
+    """Create the task of two generations: DECODE_STEPS tokens one by one, and as the runner does, with guesses.
+
+    The second writes the next of the recorded texts, each to its end. Raises ValueError where the device excludes
+    guesses.
+    """
     model = LanguageModel(artifacts, threads=threads)
     segments = prompt(workload, artifacts)
+    if (line := model.speculate()) is not None:
+        raise ValueError(line)
+    speculator = model.speculator
+    answers = itertools.cycle(json.loads(ANSWERS.read_text(encoding="utf-8"))["answers"])
+
+    def guessed() -> dict[str, float]:
+        model.speculator = speculator
+        answer = next(answers)
+        tokens = model.encode(answer["text"])
+        rules = ForcedText(tokens, artifacts.runtime.im_end_id, model.encode, context_of(answer["rules"]))
+        started_ns = time.monotonic_ns()
+        made = model.generate(segments, max_new_tokens=len(tokens) + 1, cancelled=lambda: False, constraint=rules)
+        generation_ms = (time.monotonic_ns() - started_ns) / 1e6
+        if made.token_ids != tuple(tokens):
+            raise ValueError(f"generated {made.text!r}, expected {answer['text']!r}")
+        return {"generation_ms": generation_ms, "tokens": len(tokens), "calls": len(made.call_tokens)}
 
     def run() -> dict[str, float]:
+        model.speculator = None
         made = model.generate(segments, max_new_tokens=DECODE_STEPS, cancelled=lambda: False)
         if (made.prompt_tokens, made.new_tokens) != (workload.prompt_tokens, DECODE_STEPS):
             raise ValueError(
                 f"generated {made.new_tokens} tokens after {made.prompt_tokens}, "
                 f"the benchmark is {DECODE_STEPS} after {workload.prompt_tokens}"
             )
-        return {"prefill_ms": made.prefill_ms, "decode_tokens_per_s": 1e3 * made.new_tokens / made.decode_ms}
+        plain = generation(made.prefill_ms, made.decode_ms, made.new_tokens)
+        return {**plain, "plain_generation_ms": plain["generation_ms"], **guessed()}
 
     return run
 

@@ -70,10 +70,15 @@ def language_task(prefill: Callable[[], int], step: Callable[[int], int], steps:
         prefilled_ns = time.monotonic_ns()
         for _ in range(steps):
             token = step(token)
-        decode_s = (time.monotonic_ns() - prefilled_ns) / 1e9
-        return {"prefill_ms": (prefilled_ns - started_ns) / 1e6, "decode_tokens_per_s": steps / decode_s}
+        return generation((prefilled_ns - started_ns) / 1e6, (time.monotonic_ns() - prefilled_ns) / 1e6, steps)
 
     return run
+
+
+def generation(prefill_ms: float, decode_ms: float, tokens: int) -> dict[str, float]:
+    """Return the values of a generation of so many tokens."""
+    rate = 1e3 * tokens / decode_ms
+    return {"prefill_ms": prefill_ms, "decode_tokens_per_s": rate, "generation_ms": prefill_ms + decode_ms}
 
 
 def serve(load: Callable[[Load], Mapping[str, Task]], packages: Sequence[str]) -> int:
