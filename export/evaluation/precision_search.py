@@ -40,13 +40,13 @@ class Limits:
     turn_radps: float
     relative: float = RELATIVE_LIMIT
     top1: float | None = None
-    """Smallest share of equal next tokens; ignored for untrained weights, whose logits are nearly equal."""
+    """Smallest share of equal next tokens, 0 for any; ignored for untrained weights, whose logits are nearly equal."""
     output_error: float | None = None
     """Largest relative change of the graph's output, as in the gate."""
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
-            if value is not None and not value > 0:
+            if value is not None and not (value > 0 or (name == "top1" and value == 0)):
                 raise ValueError(f"limit {name} must be positive, found {value}")
 
     def load(self, reading: Reading, *, trained: bool) -> float:

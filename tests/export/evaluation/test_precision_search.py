@@ -216,7 +216,12 @@ def test_tokens_are_only_judged_when_the_weights_are_trained() -> None:
     assert limits.load(reading, trained=True) == pytest.approx(3)
 
 
-@pytest.mark.parametrize("field", ["waypoint_cm", "relative", "top1"])
+def test_no_share_of_equal_tokens_may_be_asked_for() -> None:
+    reading = Reading(0, 0, 0, 0, 0, 0, 0.7)
+    assert dataclasses.replace(LIMITS, top1=0.0).load(reading, trained=True) < 1
+
+
+@pytest.mark.parametrize("field", ["waypoint_cm", "relative"])
 def test_limits_must_be_positive(field: str) -> None:
     with pytest.raises(ValueError, match=field):
         dataclasses.replace(LIMITS, **{field: 0})
