@@ -15,6 +15,7 @@ import pytest
 from edge.reasoning.prompt import InstructionError
 from edge.run import say
 from edge.run.instructions import MAX_BYTES, InstructionSocket, parse
+from tests.support.processes import wait_for
 
 
 def refuse_long(text: str) -> None:
@@ -125,7 +126,8 @@ def runner(path: Path) -> Iterator[list[str]]:
 
 def test_edge_say_reports_what_was_accepted(runner: list[str], path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert say.main(["turn  left", "--to", str(path)]) == 0
-    assert capsys.readouterr().out == "turn left\n" and runner == ["turn left"]
+    assert capsys.readouterr().out == "turn left\n"
+    wait_for(lambda: runner == ["turn left"], 10.0, "the runner's thread has it")
 
 
 def test_edge_say_reports_why_one_is_refused(runner: list[str], path: Path, capsys: pytest.CaptureFixture[str]) -> None:
