@@ -12,17 +12,22 @@ ROBOT ?= go2
 # Isolated tests run two at a time with one thread each; tests that start real-time processes run one at a time.
 WORKERS ?= 2
 PYTEST := $(BIN)/python -m pytest
-PARALLEL := OMP_NUM_THREADS=1 $(PYTEST) -n $(WORKERS) --dist loadfile
+SINGLE := OMP_NUM_THREADS=1 $(PYTEST)
+PARALLEL := $(SINGLE) -n $(WORKERS) --dist loadfile
 PROCESS_FILES = $(shell grep -rlF --include='test_*.py' mark.process tests)
-# Both kinds run beside each other, because tests of processes mostly wait; the isolated ones have the lowest priority.
-# They share a folder, so that the model is exported once. $(1): the tests' name, $(2): options, $(3): marker.
+# Tests of processes mostly wait, so isolated ones run beside them, with the lowest priority. They share a folder, so that
+# the model is exported once. $(1): the tests' name, $(2): options, $(3): marker, $(4): what runs beside, $(5): afterwards.
 tiers = @folder=$$(mktemp -d) && export EDGE_TEST_FOLDER="$$folder" && \
 	trap 'kill $$isolated 2>/dev/null; wait $$isolated; rm -rf "$$folder"' EXIT && \
-	{ nice -n 19 env $(PARALLEL) $(2) -m "$(3)not process" > "$$folder/isolated.log" 2>&1 & } && isolated=$$!; \
+	{ nice -n 19 env $(4) $(2) -m "$(3)not process" > "$$folder/isolated.log" 2>&1 & } && isolated=$$!; \
 	echo "== $(1) tests of processes, one at a time" && \
 	{ $(PYTEST) $(2) -m "$(3)process and not repeated" $(PROCESS_FILES); processes=$$?; } ; \
 	wait $$isolated; code=$$?; isolated=; \
-	echo "== $(1) tests, $(WORKERS) at a time" && cat "$$folder/isolated.log" && test $$processes = 0 && test $$code = 0
+	echo "== isolated $(1) tests" && cat "$$folder/isolated.log" && \
+	$(if $(5),{ $(5) $(2) -m "$(3)not process" || code=1; } &&) test $$processes = 0 && test $$code = 0
+# Slow tests of processes drive robots in real time: they leave one core to a single process of these tests.
+BESIDE := tests/calib tests/edge tests/firmware_bridge tests/process
+slow_tiers = $(call tiers,$(1),--durations=15,$(2),$(SINGLE) $(BESIDE),$(PARALLEL) $(BESIDE:%=--ignore=%) tests)
 # Tests start hundreds of processes; without compiled modules on the disk each would compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
@@ -101,10 +106,10 @@ lint: .venv/.test-installed
 	$(BIN)/mypy
 
 test: lint
-	$(call tiers,fast,,not slow and )
+	$(call tiers,fast,,not slow and ,$(PARALLEL))
 
 test-slow: .venv/.test-installed
-	$(call tiers,slow,--durations=15,slow and )
+	$(call slow_tiers,slow,slow and )
 
 # Shrinking a failing example takes up to 5 minutes: longer than the usual time limit of a test.
 test-random: .venv/.test-installed
@@ -113,7 +118,7 @@ test-random: .venv/.test-installed
 	$(PARALLEL) -m "hypothesis and not process" --timeout 600 --hypothesis-profile=random --hypothesis-seed=$$seed
 
 test-all: lint
-	$(call tiers,all,--durations=15,)
+	$(call slow_tiers,all,)
 
 stops: .venv/.test-installed
 	$(PYTEST) -s -m repeated tests/process/bridge
