@@ -197,6 +197,7 @@ def test_a_file_above_the_allowed_size_leaves_the_old_release(tmp_path: Path) ->
     versions.sources(2)
 
     def limited() -> int:
+        sys.dont_write_bytecode = True  # Python leaves a .pyc that was cut off by the limit
         resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
         return versions.install(2)
 

@@ -94,6 +94,7 @@ def _be(function: Any, case: dict[str, Any], out: int, err: int) -> NoReturn:
         sys.stderr = os.fdopen(2, "w", encoding="utf-8", errors="backslashreplace")
         resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_BYTES, MEMORY_BYTES))
         if case["small_files"]:
+            _write_no_bytecode()
             resource.setrlimit(resource.RLIMIT_FSIZE, (SMALL_FILE_BYTES, SMALL_FILE_BYTES))
         if case["unprivileged"]:
             _drop_capabilities()
@@ -111,6 +112,12 @@ def _be(function: Any, case: dict[str, Any], out: int, err: int) -> NoReturn:
             sys.stderr.flush()
         finally:
             os._exit(code)
+
+
+def _write_no_bytecode() -> None:
+    """Keep this process and its children from writing .pyc files: Python leaves one that was cut off by the limit."""
+    sys.dont_write_bytecode = True
+    os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
 
 
 def _drop_capabilities() -> None:
