@@ -62,7 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         failure = ""
 
         def lost() -> str | None:
-            return None if args.to_the_end else lost_budget(soak, budget)
+            return None if args.to_the_end else lost_budget(soak, budget, menu)
 
         try:
             with Progress("edge-soak: ", period_s=STATUS_PERIOD_S) as progress:

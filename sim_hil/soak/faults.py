@@ -28,6 +28,8 @@ EXPECTED: Final = ("limit", "zero", "stop", "nothing")
 PROCESSES: Final = ("edge-run", "edge-bridge")
 SIGNALS: Final = ("SIGKILL", "SIGTERM")
 LONGEST_S: Final = 600.0
+MOVED_M: Final = 0.1
+"""Default of `moved_m` of a fault: the pictures of a robot that stands still may repeat."""
 FORMAT: Final = 1
 
 
@@ -37,7 +39,10 @@ class SoakInputError(ValueError):
 
 @dataclass(frozen=True)
 class SoakFault:
-    """One kind of fault; `inject` and `expect` as in the default file, `for_s`: range of its duration, s."""
+    """One kind of fault; `inject` and `expect` as in the default file, `for_s`: range of its duration, s.
+
+    `moved_m`: least path during the fault, m, on which the runner must find it.
+    """
 
     name: str
     inject: str
@@ -46,6 +51,7 @@ class SoakFault:
     fault: str
     expect: str
     values: Mapping[str, Value] = field(default_factory=dict)
+    moved_m: float = MOVED_M
 
     def __post_init__(self) -> None:
         what = f"fault {self.name!r}"
@@ -54,6 +60,8 @@ class SoakFault:
             raise SoakInputError(f"{what}: expected ascending for_s up to {LONGEST_S:g} s, found {self.for_s}")
         if self.weight <= 0:
             raise SoakInputError(f"{what}: expected a weight above 0, found {self.weight}")
+        if self.moved_m < 0:
+            raise SoakInputError(f"{what}: expected moved_m of 0 m or more, found {self.moved_m:g}")
         if self.expect not in EXPECTED:
             raise SoakInputError(f"{what}: expected one of {', '.join(EXPECTED)}, found {self.expect!r}")
         if self.fault and self.fault not in FAULTS:
@@ -141,9 +149,10 @@ def load_menu(path: Path) -> FaultMenu:
 
 
 def _fault(table: Table) -> SoakFault:
-    texts = {key: table.text(key) for key in ("name", "inject", "fault", "expect")}
-    values = table.take("values", {})
-    fault = SoakFault(**texts, for_s=table.vector("for_s", 2), weight=table.number("weight"), values=values)
+    name, inject, fault_name, expect = (table.text(key) for key in ("name", "inject", "fault", "expect"))
+    for_s, weight, values = table.vector("for_s", 2), table.number("weight"), table.take("values", {})
+    moved_m = table.number("moved_m", MOVED_M)
+    fault = SoakFault(name, inject, for_s, weight, fault_name, expect, values, moved_m)
     table.done()
     return fault
 

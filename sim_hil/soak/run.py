@@ -232,9 +232,9 @@ def _stack_options(
     )
 
 
-def lost_budget(soak: SoakFolder, budget: Sequence[BudgetLine]) -> str | None:
+def lost_budget(soak: SoakFolder, budget: Sequence[BudgetLine], menu: FaultMenu | None) -> str | None:
     """Return in one line which budget line no later leg can meet; None while all can be met."""
-    found = measures(soak.legs, soak.samples())
+    found = measures(soak.legs, soak.samples(), menu)
     judged = [judge(line, found[line.measure]) for line in budget]
     lost = [f"{line['measure']} is {line['found']['value']:g}, {limit_text(line)}" for line in judged if is_lost(line)]
     return f"the budget is lost: {'; '.join(lost)}" if lost else None
@@ -250,7 +250,7 @@ def soak_result(
 ) -> dict[str, Any]:
     """Return the result for `--json`; `coverage`: injections of every fault of the menu."""
     names = [] if menu is None else [fault.name for fault in menu.faults]
-    found = measures(soak.legs, soak.samples(), names)
+    found = measures(soak.legs, soak.samples(), menu)
     injected = Counter(fault["name"] for leg in soak.legs for fault in leg["faults"])
     judged = [judge(line, found[line.measure]) for line in budget]
     verdicts = {line["verdict"] for line in judged}

@@ -14,7 +14,7 @@ from scipy.stats import theilslopes
 from edge.core.stats import percentiles
 from sim_hil.realtime.host_stall import STALL_PRIORITY
 from sim_hil.scene.table import Table
-from sim_hil.soak.faults import SoakInputError, read_file
+from sim_hil.soak.faults import MOVED_M, FaultMenu, SoakFault, SoakInputError, read_file
 from sim_hil.soak.trends import BRIDGE_PERIOD_MS, SERIES, jitter_ms, stalls_of, trends
 
 DEFAULT_BUDGET: Final = Path(__file__).with_name("budget.toml")
@@ -144,8 +144,6 @@ def slope(times_s: Sequence[float], values: Sequence[float]) -> Slope | None:
 
 
 PROCESSES: Final = ("edge-run", "edge-bridge", "edge-hil")
-MOVED_M: Final = 0.1
-"""Least motion during a fault, m, for it to count among the faults that the runner must detect."""
 MIB: Final = 2.0**20
 
 Analysis = Mapping[str, Any]
@@ -164,8 +162,8 @@ def process_lives(samples: Samples, name: str, key: str) -> list[tuple[list[floa
     return list(lives.values())
 
 
-def measures(legs: Sequence[Analysis], samples: Sequence[Samples], menu: Sequence[str] = ()) -> dict[str, Measure]:
-    """Return every measure by name; `menu`: names of the faults that may be injected."""
+def measures(legs: Sequence[Analysis], samples: Sequence[Samples], menu: FaultMenu | None = None) -> dict[str, Measure]:
+    """Return every measure by name; `menu`: the faults that may be injected."""
     found: dict[str, Measure] = {}
     for name in PROCESSES:
         found[f"memory_slope_mib_per_h.{name}"] = _slope(samples, name, "rss_bytes", MIB, "MiB/h")
@@ -195,14 +193,12 @@ def measures(legs: Sequence[Analysis], samples: Sequence[Samples], menu: Sequenc
     found["log_records_dropped"] = Measure(sum(life["dropped"] for life in lives), "", len(lives))
     _tasks(found, [task for leg in legs for task in leg["tasks"] if task["end"] != "cut"])
     _stops(found, legs)
+    _faults(found, [fault for leg in legs for fault in leg["faults"]], () if menu is None else menu.faults)
     factors = [leg["real_time_factor"] for leg in legs if leg["real_time_factor"]]
     found["real_time_factor.min"] = Measure(min(factors, default=None), "", len(factors))
     drift = [100 * error / path for leg in legs for error, path in leg["drift"]]
     _points(found, "drift_percent", drift, "% of the path", "p50", "p99", "max")
     _power(found, lives)
-    injected = {fault["name"] for leg in legs for fault in leg["faults"]}
-    covered = round(100 * len(injected & set(menu)) / len(menu), 1) if menu else None
-    found["faults_covered_percent"] = Measure(covered, "% of the menu", len(menu))
     for name, line in trends(legs).items():
         low, high = (None, None) if line is None else (round(line.low, 3), round(line.high, 3))
         value, count = (None, 0) if line is None else (round(line.per_h, 3), line.number)
@@ -249,16 +245,21 @@ def _stops(found: dict[str, Measure], legs: Sequence[Analysis]) -> None:
     ran = bool(ends) or any(leg["lives"] for leg in legs)
     unexplained = sum(not end["explained"] for end in ends) if ran else None
     found["stops_unexplained"] = Measure(unexplained, "", len(ends), note="" if ran else "no runner has driven")
-    # For a standing robot, an unchanged image is normal.
+
+
+def _faults(found: dict[str, Measure], injected: Sequence[Mapping[str, Any]], menu: Sequence[SoakFault]) -> None:
+    found["faults_injected"] = Measure(len(injected), "", len(injected))
+    least_m = {fault.name: fault.moved_m for fault in menu}
     faults = [
         fault
-        for leg in legs
-        for fault in leg["faults"]
-        if fault["fault"] and fault["end_ns"] is not None and fault["moved_m"] >= MOVED_M
+        for fault in injected
+        if fault["fault"] and fault["end_ns"] is not None and fault["moved_m"] >= least_m.get(fault["name"], MOVED_M)
     ]
-    found["faults_injected"] = Measure(sum(len(leg["faults"]) for leg in legs), "", len(legs))
     silent = sum(fault["raised_ns"] is None and fault["other_ns"] is None for fault in faults)
     found["faults_unanswered"] = Measure(silent if faults else None, "", len(faults), note="" if faults else "no fault")
+    covered = len({fault["name"] for fault in injected} & set(least_m))
+    percent = round(100 * covered / len(menu), 1) if menu else None
+    found["faults_covered_percent"] = Measure(percent, "% of the menu", len(menu))
 
 
 def _power(found: dict[str, Measure], lives: Sequence[Mapping[str, Any]]) -> None:

@@ -70,6 +70,7 @@ def test_default_faults_expect_the_action_of_the_fault_table() -> None:
         ('inject = "camera-stop"', 'inject = "process:edge-hil:SIGKILL"', "process:NAME:SIGNAL"),
         ("weight = 1.0", "weight = 1.0\nvalues = { delay_s = 1.0 }", "delay_s"),
         ("weight = 1.0", "weight = 1.0\nvalues = 3", "values"),
+        ("weight = 1.0", "weight = 1.0\nmoved_m = -0.1", "moved_m"),
         ("format = 1", "format = 2", "format"),
     ],
 )

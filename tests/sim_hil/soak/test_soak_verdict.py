@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from sim_hil.soak import cli
-from sim_hil.soak.faults import SoakInputError
+from sim_hil.soak.faults import DEFAULT_MENU, SoakInputError, load_menu
 from sim_hil.soak.report import write_report
 from sim_hil.soak.run import SoakFolder, SoakOptions, soak_result
 from sim_hil.soak.verdict import (
@@ -206,9 +207,20 @@ def test_the_coverage_counts_the_kinds_of_the_menu_that_were_injected() -> None:
     leg = empty_leg()
     fault = {"fault": "camera-frozen", "end_ns": 2, "moved_m": 1.0, "raised_ns": 1, "other_ns": None}
     leg["faults"] = [{**fault, "name": "camera freezes"}, {**fault, "name": "camera freezes"}]
-    found = measures([leg], [[]], ["camera freezes", "camera stops"])
+    menu = load_menu(DEFAULT_MENU)
+    faults = tuple(one for one in menu.faults if one.name in ("camera freezes", "camera stops"))
+    found = measures([leg], [[]], replace(menu, faults=faults))
     assert found["faults_covered_percent"].value == 50.0
     assert measures([leg], [[]])["faults_covered_percent"].value is None
+
+
+@pytest.mark.parametrize(("moved_m", "counted"), [(0.05, 0), (0.2, 1), (0.3, 2)])
+def test_a_fault_must_be_found_once_the_robot_has_driven_as_far_as_the_menu_says(moved_m: float, counted: int) -> None:
+    """A frozen picture with a clock is found by distance, one without at the first motion."""
+    silent = {"fault": "camera-frozen", "end_ns": 2, "moved_m": moved_m, "raised_ns": None, "other_ns": None}
+    leg = empty_leg() | {"faults": [{**silent, "name": n} for n in ("camera freezes", "clock in a frozen picture")]}
+    unanswered = measures([leg], [[]], load_menu(DEFAULT_MENU))["faults_unanswered"]
+    assert unanswered.count == counted and unanswered.value == (counted or None)
 
 
 @pytest.mark.parametrize(
