@@ -18,6 +18,7 @@ from typing import Any, Final, TextIO
 
 import psutil
 
+from edge.core.cli import EXIT_REFUSED
 from edge.core.device import read_device
 from edge.run.say import SayError, say
 from firmware_bridge.system.input_file import read_json
@@ -209,7 +210,8 @@ class Leg:
         code = self._stack.end("runner")  # takes a little longer if the bridge was killed
         self._stack.end("bridge")
         cause, raised = _end_of_run(self._stack.result(f"edge-run-{self._stack.runs}"))
-        if explained == CONTACT and not raised & CONTACT_STOPS:
+        refused = not self._armed and code == EXIT_REFUSED
+        if explained == CONTACT and not contact_explains(raised, refused=refused):
             explained = ""
         about = {"cause": cause, "explained": explained, "during": during, "bridge_died": bridge_died}
         self._note("life_end", run=self._stack.runs, code=code, **about)
@@ -305,6 +307,14 @@ class Leg:
 
     def _note(self, kind: str, **fields: Any) -> None:
         _append(self._events, {"t_ns": time.monotonic_ns(), "kind": kind, **fields})
+
+
+def contact_explains(raised: set[str], *, refused: bool) -> bool:
+    """Return whether a contact explains the end of a runner that raised these faults, or whose arming was refused.
+
+    A robot that fell onto an obstacle leans on it until somebody lifts it, and no later runner may arm it.
+    """
+    return refused or bool(raised & CONTACT_STOPS)
 
 
 def _end_of_run(result: Path) -> tuple[str, set[str]]:

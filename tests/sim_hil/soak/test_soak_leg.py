@@ -13,7 +13,7 @@ from edge.run.say import SayError
 from sim_hil.realtime.stack import StackOptions
 from sim_hil.realtime.truth import TruePose, read_lines
 from sim_hil.soak import leg as soak_leg
-from sim_hil.soak.leg import EVENTS, Leg, LegOptions
+from sim_hil.soak.leg import EVENTS, Leg, LegOptions, contact_explains
 from sim_hil.soak.tasks import SoakTask
 
 S = 1_000_000_000
@@ -67,3 +67,18 @@ def test_an_instruction_is_sent_again_to_a_runner_too_busy_to_answer(
     kinds = [event["kind"] for event in read_lines(tmp_path / EVENTS) if event["kind"].startswith(("task", "not"))]
     assert kinds[:6] == ["task_begin", "task_end", "not_told", "not_told", "not_told", "task_begin"]
     assert all(b - a >= S for a, b in itertools.pairwise(sent_ns[:4]))
+
+
+@pytest.mark.parametrize(
+    ("raised", "refused", "explains"),
+    [
+        ({"tipped-over", "frames-late"}, False, True),
+        (set(), True, True),  # the robot still leans on what it fell onto: it must not be armed
+        (set(), False, False),
+        ({"deadman"}, False, False),
+    ],
+)
+def test_a_contact_explains_a_fall_and_a_refusal_to_arm_but_no_other_end(
+    raised: set[str], refused: bool, explains: bool
+) -> None:
+    assert contact_explains(raised, refused=refused) is explains
