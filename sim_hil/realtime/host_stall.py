@@ -115,14 +115,6 @@ def stalled_ns(stalls: Stalls, begin_ns: NDArray[np.int64], end_ns: NDArray[np.i
     return until(end_ns) - until(begin_ns)
 
 
-def woken_after(stalls: Stalls, at_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return when the stalls end in which n instants lie, and the instants [n] themselves outside of stalls, ns."""
-    if not len(stalls):
-        return at_ns
-    index = np.searchsorted(stalls[:, 0], at_ns, side="right") - 1
-    return np.maximum(at_ns, np.where(index >= 0, stalls[np.maximum(index, 0), 1], 0))
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Write the stalls of every processor to a JSON-lines file until SIGINT or SIGTERM; 1 if the file takes no more."""
     (path,) = sys.argv[1:] if argv is None else argv

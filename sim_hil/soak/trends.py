@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import theilslopes
 
-from sim_hil.realtime.host_stall import Stalls, stalled_ns, woken_after
+from sim_hil.realtime.host_stall import Stalls, stalled_ns
 
 Array = NDArray[np.float64]
 Analysis = Mapping[str, Any]
@@ -66,15 +66,15 @@ def stalls_of(leg: Analysis) -> Stalls:
 def jitter_ms(leg: Analysis) -> Array:
     """Return how far each gap between two commands [n] is off the bridge's period, less the machine's stalls, ms.
 
-    Only what stalls after a command is due counts, and no stall during which the bridge has sent one: it did not hold
-    the bridge. A short gap is reduced by the stalls of the gap before it.
+    Only what stalls after a command is due counts: also on one processor alone, where the scheduler may have put the
+    bridge. A short gap is reduced by the stalls of the gap before it.
     """
     off: Array = np.array(leg["command_gap_ms"], float) - BRIDGE_PERIOD_MS
     end_ns = np.array(leg["command_ns"], np.int64)
     begin_ns = end_ns - np.rint((off + BRIDGE_PERIOD_MS) * 1e6).astype(np.int64)
     stalls = stalls_of(leg)
-    from_ns = np.maximum(begin_ns + round(BRIDGE_PERIOD_MS * 1e6), woken_after(stalls, begin_ns))
-    stalled = stalled_ns(stalls, np.minimum(from_ns, end_ns), end_ns) / 1e6
+    due_ns = begin_ns + round(BRIDGE_PERIOD_MS * 1e6)
+    stalled = stalled_ns(stalls, np.minimum(due_ns, end_ns), end_ns) / 1e6
     follows = np.abs(begin_ns[1:] - end_ns[:-1]) < 1_000_000
     before = np.concatenate((np.zeros(min(1, len(off))), np.where(follows, stalled[:-1], 0)))
     jitter: Array = np.maximum(np.abs(off) - np.where(off > 0, stalled, before), 0)

@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sim_hil.realtime import host_stall
-from sim_hil.realtime.host_stall import HostStall, read_stalls, stalled_ns, watch_sleeps, woken_after
+from sim_hil.realtime.host_stall import HostStall, read_stalls, stalled_ns, watch_sleeps
 from tests.support.processes import wait_for
 
 times = st.integers(0, 1000)
@@ -95,18 +95,6 @@ def test_a_window_is_stalled_as_long_as_a_sum_over_its_stalls(spans: list[list[i
     edges = np.flatnonzero(np.diff(np.concatenate(([False], ticks, [False])).astype(int)))
     apart = edges.reshape(-1, 2).astype(np.int64)
     assert stalled_ns(apart, np.array([begin]), np.array([end])).tolist() == [int(ticks[begin:end].sum())]
-
-
-@given(st.lists(st.tuples(times, times).map(sorted), max_size=8), times)
-def test_an_instant_within_a_stall_is_moved_to_its_end(spans: list[list[int]], at: int) -> None:
-    begin, apart = 0, []
-    for due, woken in sorted(spans):
-        if due > begin and woken > due:
-            apart.append([due, woken])
-            begin = woken
-    expected = next((woken for due, woken in apart if due <= at < woken), at)
-    stalls = np.array(apart, np.int64).reshape(-1, 2)
-    assert woken_after(stalls, np.array([at])).tolist() == [expected]
 
 
 def test_a_harness_sums_the_stalls_inside_a_window() -> None:
