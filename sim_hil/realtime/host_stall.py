@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
@@ -52,33 +52,57 @@ def watch_sleeps(ended: Callable[[], bool], add: Callable[[int, int], None], sle
 
 
 class HostStall:
-    """Context manager that measures the delays of repeated 1 ms sleeps.
+    """Context manager that measures the delays of repeated 1 ms sleeps on each processor.
 
-    A bound in milliseconds on other processes is meaningful only if the machine schedules processes in time.
+    A bound in milliseconds on other processes is meaningful only if the machine schedules processes in time. A sleep
+    that may end on any processor misses the stalls of a single one, which hold a process that runs there.
     """
 
     def __init__(self) -> None:
         self._stalls: deque[tuple[int, int]] = deque(maxlen=_KEEP)  # (when the sleep should have ended, when it did)
         self._ending = threading.Event()
-        self._thread = threading.Thread(
-            target=watch_sleeps, args=(self._ending.is_set, self.add), name="host-stall", daemon=True
-        )
+        self._threads = [
+            threading.Thread(target=self._watch, args=(cpu,), name=f"host-stall-{cpu}", daemon=True)
+            for cpu in sorted(os.sched_getaffinity(0))
+        ]
 
     def __enter__(self) -> HostStall:
-        self._thread.start()
+        for thread in self._threads:
+            thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._ending.set()
-        self._thread.join()
+        for thread in self._threads:
+            thread.join()
+
+    def _watch(self, cpu: int) -> None:
+        _stay_on(cpu)
+        watch_sleeps(self._ending.is_set, self.add)
 
     def add(self, due_ns: int, woken_ns: int) -> None:
         """Record a sleep that ended at `woken_ns` instead of `due_ns`."""
         self._stalls.append((due_ns, woken_ns))
 
     def between_ns(self, begin_ns: int, end_ns: int) -> int:
-        """Return the sum of the stalls inside a window, ns; 0 on an idle machine."""
-        return sum(max(min(late, end_ns) - max(due, begin_ns), 0) for due, late in list(self._stalls))
+        """Return how long any processor stalled inside a window, ns; 0 on an idle machine."""
+        return sum(max(min(late, end_ns) - max(due, begin_ns), 0) for due, late in _apart(list(self._stalls)))
+
+
+def _stay_on(cpu: int) -> None:
+    with suppress(OSError):  # the processor is no longer there: watch on another one
+        os.sched_setaffinity(0, {cpu})
+
+
+def _apart(stalls: Iterable[tuple[int, int]]) -> list[list[int]]:
+    """Return stalls in order, those that overlap as one."""
+    merged: list[list[int]] = []
+    for due_ns, woken_ns in sorted(stalls):
+        if merged and due_ns <= merged[-1][1]:
+            merged[-1][1] = max(merged[-1][1], woken_ns)
+        else:
+            merged.append([due_ns, woken_ns])
+    return merged
 
 
 def read_stalls(path: Path) -> Stalls | None:
@@ -90,13 +114,8 @@ def read_stalls(path: Path) -> Stalls | None:
     begins = [line[REAL_TIME] for line in lines if REAL_TIME in line]
     if not begins or not all(begins):
         return None
-    merged: list[list[int]] = []
-    for due_ns, woken_ns in sorted((line["due_ns"], line["woken_ns"]) for line in lines if "due_ns" in line):
-        if merged and due_ns <= merged[-1][1]:
-            merged[-1][1] = max(merged[-1][1], woken_ns)
-        else:
-            merged.append([due_ns, woken_ns])
-    return np.array(merged, np.int64).reshape(-1, 2)
+    stalls = _apart((line["due_ns"], line["woken_ns"]) for line in lines if "due_ns" in line)
+    return np.array(stalls, np.int64).reshape(-1, 2)
 
 
 def stalled_ns(stalls: Stalls, begin_ns: NDArray[np.int64], end_ns: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -132,8 +151,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 ending.set()
 
         def watch(cpu: int) -> None:
-            with suppress(OSError):  # the processor is no longer there: watch on another one
-                os.sched_setaffinity(0, {cpu})
+            _stay_on(cpu)
             real_time = os.sched_getscheduler(0) in (os.SCHED_FIFO, os.SCHED_RR)
             above = real_time and os.sched_getparam(0).sched_priority > BRIDGE_PRIORITY
             write({"cpu": cpu, REAL_TIME: above})

@@ -101,4 +101,20 @@ def test_a_harness_sums_the_stalls_inside_a_window() -> None:
     host = HostStall()
     host.add(10, 30)
     host.add(50, 60)
-    assert host.between_ns(20, 55) == pytest.approx(15)
+    assert host.between_ns(20, 55) == 15
+
+
+def test_a_harness_counts_the_time_once_in_which_two_processors_stalled() -> None:
+    host = HostStall()
+    host.add(10, 30)
+    host.add(15, 40)
+    assert host.between_ns(0, 100) == 30
+
+
+def test_a_harness_watches_on_each_processor(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stall of one processor holds what runs there, and a sleep that moves to the other one ends in time."""
+    watched: list[set[int]] = []
+    monkeypatch.setattr(host_stall, "watch_sleeps", lambda *_: watched.append(os.sched_getaffinity(0)))
+    with HostStall():
+        pass
+    assert sorted(watched, key=min) == [{cpu} for cpu in sorted(os.sched_getaffinity(0))]
