@@ -81,7 +81,9 @@ def _main(args: argparse.Namespace) -> dict[str, Any]:
     steps = steps_of(args.command, recipe) if args.command != "card" else []
     if args.drives is not None:
         steps = [step for step in steps if step.stage != "collect" or not args.dry_run]
+    before = chain.steps_until(args.after, recipe, steps) if args.after is not None else []
     if args.dry_run:
+        steps = [step for step in steps if step not in before]
         plan = chain.budget_of(recipe, steps, args.device)
         sys.stderr.write("\n".join(chain.lines_of(recipe, steps, plan, args.device)) + "\n")
         return {"command": args.command, "recipe": recipe.name, "budget": chain.as_json(plan)}
@@ -89,7 +91,6 @@ def _main(args: argparse.Namespace) -> dict[str, Any]:
         run_dir = RunDir(args.out)
         shipped = None if args.ship is None else str(ship(run_dir, recipe, args.ship, args.scores))
         return {"command": "card", "card": str(write_card(run_dir, recipe, args.scores)), "shipped": shipped}
-    before = chain.steps_until(args.after, recipe, steps) if args.after is not None else []
     _check_device(args.device)
     with ranks_of_environment(args.device) as ranks, deterministic(args.device):
         return _train(args, recipe, steps, before, ranks)

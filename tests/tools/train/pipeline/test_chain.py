@@ -247,6 +247,13 @@ def test_stages_are_run_one_by_one_into_one_folder(tmp_path: Path, stages: None,
     assert "sft: done before" in capsys.readouterr().err
 
 
+def test_a_dry_run_after_given_weights_leaves_out_what_they_replace(tmp_path: Path, capsys: Any) -> None:
+    weights = ("--checkpoint", "w.safetensors", "--after", "imitate", "--set", "dagger.newest_only=true")
+    assert run("all", "--preset", "tiny", "--out", tmp_path / "run", *weights, "--dry-run", "--json", "-") == EXIT_DONE
+    budget = json.loads(capsys.readouterr().out)["budget"]
+    assert budget[0]["step"] == "dagger-1"
+
+
 def test_a_dry_run_prints_the_steps_and_writes_nothing(tmp_path: Path, capsys: Any) -> None:
     assert run("all", "--preset", "tiny", "--out", tmp_path / "run", "--dry-run", "--json", "-") == EXIT_DONE
     printed = capsys.readouterr()
