@@ -1,7 +1,7 @@
 """Robot description files (`firmware_bridge/robots/*.toml`): read, checked key by key, frozen.
 
 Such a file contains every difference between the simulated robot and a real one. Between `go2_sim.toml` and `go2.toml`
-only the `[dds]` addresses differ. The tables are declared in `sections.py` and `config_*.py`.
+only the `[dds]` addresses and `operator_arm` differ. The tables are declared in `sections.py` and `config_*.py`.
 """
 
 from __future__ import annotations

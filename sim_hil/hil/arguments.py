@@ -45,8 +45,10 @@ EPILOG: Final = """examples:
   FAULT      drop, corrupt, duplicate, delay: probability per frame; delay_s (0.05); bus_off_every_s (0: never) and
              bus_off_s (0.2); babble_hz (0: none), babble_from_s and babble_s: a node that sends continuously
   default    serial:RUNTIME/carter-can in the user's runtime directory; the ready line names it
---link of mavlink: udp:HOST:PORT[,to=HOST:PORT...][,camera=PORT][,system=NUMBER][,key=FILE][,IMPAIRMENT=NUMBER...]
+--link of mavlink: udp:HOST:PORT[,to=HOST:PORT...][,camera=PORT][,system=NUMBER][,key=FILE]
+             [,autopilot=NAME][,IMPAIRMENT=NUMBER...]
   to         address that receives heartbeats unasked; key: file of a signing key, then unsigned packets are ignored
+  autopilot  px4 (default) or ardupilot, which it announces
   IMPAIRMENT of both directions: loss_percent, loss_burst (mean length), delay_ms, jitter_ms (standard deviation),
              duplicate_percent, reorder_percent, reorder_ms (20)
   default    udp:127.0.0.1:14580,to=127.0.0.1:14540,to=127.0.0.1:14550

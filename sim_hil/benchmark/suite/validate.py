@@ -33,8 +33,8 @@ LENGTH_TOLERANCE_M = 0.02
 MAX_GOAL_GAP_M = 1.6  # maximum distance from the landmark's outline to the goal
 
 _EXAMPLES = """examples:
-  python -m sim_hil.benchmark.suite.validate
-  python -m sim_hil.benchmark.suite.validate --suite my_suite.toml --json -
+  edge-bench validate
+  edge-bench validate --suite my_suite.toml --json -
 exit codes: 0 all valid, 1 an episode is invalid, 2 the suite or a scene cannot be read"""
 
 
@@ -150,7 +150,7 @@ def validate(episodes: Sequence[Episode]) -> dict[str, list[str]]:
 def main(argv: list[str] | None = None) -> int:
     """Run the command and return its exit code."""
     parser = CommandParser(
-        prog="python -m sim_hil.benchmark.suite.validate",
+        prog="edge-bench validate",
         description="Check that a suite's episodes are feasible and their instructions are true.",
         epilog=_EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip

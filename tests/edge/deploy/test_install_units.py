@@ -55,7 +55,7 @@ def units(artifacts_dir: Path, tmp_path: Path, host: Host) -> Units:
     """Runs the command; its exit code and its result."""
 
     robot = tmp_path / "go2.toml"
-    robot.write_text(SHIPPED.read_text().replace("operator_arm = false", "operator_arm = true"))
+    robot.write_text(SHIPPED.read_text())
 
     def run(
         *more: str, on: Host = host, artifacts: Path = artifacts_dir, text: str = "walk", robot: Path = robot
@@ -70,6 +70,14 @@ def units(artifacts_dir: Path, tmp_path: Path, host: Host) -> Units:
         return code, json.loads(result.read_text()) if result.exists() else None
 
     return run
+
+
+@pytest.fixture
+def alone(tmp_path: Path) -> Path:
+    """File of a robot whose runner arms by itself."""
+    robot = tmp_path / "alone.toml"
+    robot.write_text(SHIPPED.read_text().replace("operator_arm = true", "operator_arm = false"))
+    return robot
 
 
 def test_it_writes_both_units_and_the_user_and_prints_the_start_command(units: Units, tmp_path: Path) -> None:
@@ -119,16 +127,16 @@ def test_the_emergency_stop_of_this_service_is_printed(
 
 
 def test_a_robot_that_would_drive_as_soon_as_its_service_starts_is_refused_in_one_line(
-    units: Units, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    units: Units, alone: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert units(robot=SHIPPED) == (EXIT_BAD_INPUT, None)
+    assert units(robot=alone) == (EXIT_BAD_INPUT, None)
     error = capsys.readouterr().err
     assert "safety.operator_arm: expected true, found false" in error and error.count("\n") == 1
     assert not (tmp_path / "units").exists()
 
 
-def test_with_consent_it_is_written_and_not_enabled_at_boot(units: Units, tmp_path: Path) -> None:
-    code, result = units("--arm-at-start", robot=SHIPPED)
+def test_with_consent_it_is_written_and_not_enabled_at_boot(units: Units, alone: Path, tmp_path: Path) -> None:
+    code, result = units("--arm-at-start", robot=alone)
     assert (code, result and result["commands"][-1]) == (EXIT_DONE, f"sudo systemctl start {RUNNER_UNIT}")
     assert result is not None
     assert not any("enable" in command and RUNNER_UNIT in command for command in result["commands"])

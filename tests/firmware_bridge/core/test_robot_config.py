@@ -15,10 +15,16 @@ from tests.support.processes import GO2_SIM
 GO2 = GO2_SIM.with_name("go2.toml")
 
 
-def test_simulated_and_real_robot_differ_in_their_addresses_only() -> None:
+def test_simulated_and_real_robot_differ_in_addresses_and_arming_only() -> None:
     simulated, real = load_robot_config(GO2_SIM), load_robot_config(GO2)
     assert simulated.dds.interface == "lo" != real.dds.interface and real.bridge.deadman_ms == 250
-    assert replace(simulated, dds=real.dds) == real
+    assert replace(simulated, dds=real.dds, safety=replace(simulated.safety, operator_arm=True)) == real
+
+
+@pytest.mark.parametrize("path", sorted(GO2_SIM.parent.glob("*.toml")), ids=lambda path: path.stem)
+def test_a_runner_arms_by_itself_on_simulated_robots_only(path: Path) -> None:
+    """Who copies a real robot's file and starts the programs must not set it in motion by that."""
+    assert load_robot_config(path).safety.operator_arm == (not path.stem.endswith("_sim"))
 
 
 def test_a_relative_socket_lies_in_the_runtime_directory(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
