@@ -8,16 +8,12 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import ctypes
-import gc
 import json
 import os
 import select
-import signal
 import socket
 import sys
 import time
-from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Final
@@ -41,11 +37,13 @@ from firmware_bridge.system.latch_file import LatchFile, read_latch
 from firmware_bridge.system.line_log import LineLog
 from firmware_bridge.system.notify import Notifier
 from firmware_bridge.system.output_file import check_output, write_descriptor, write_output
+from firmware_bridge.system.process import lock_memory, settle_memory, signals_to_socket, take_priority
 from firmware_bridge.system.terminal import CommandParser, one_line
 
 _OPERATORS: Final = 4  # at a time
 _OBSERVERS: Final = 4
 _LOG_TIMEOUT_S: Final = 0.5
+_JOIN_AGAIN_NS: Final = 1_000_000_000
 _LAST_ZEROS: Final = 5  # ticks of zeros between a signal and the exit
 _LATE_NS: Final = 50_000_000  # a step this late is no sign of life for the watchdog
 _PAUSE_NS: Final = 1_000_000
@@ -53,7 +51,6 @@ _PAUSE_NS: Final = 1_000_000
 because LimitRTTIME kills it then. Far below every bound on a stop."""
 _STARTING_S: Final = 20.0  # the unit's TimeoutStartSec, which moves on while the bridge waits for its interface
 _EXTEND_NS: Final = 5_000_000_000
-_LOCK_PRESENT_FUTURE_ONCE_TOUCHED: Final = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT of <sys/mman.h>
 
 EPILOG: Final = """examples:
   edge-bridge --robot go2.toml --socket /run/tic-vla-edge/bridge.sock --json result.json
@@ -68,10 +65,10 @@ EPILOG: Final = """examples:
 stop, arm, release and status look for a bridge at the installed service's socket (run them with sudo then, or as a
 member of tic-vla-operators) and at the robot file's, or at --socket only. With a robot file that cannot be used, stop
 looks at the usual places.
-exit codes: 0 ended by SIGINT or SIGTERM, robot stopped (stop, arm, release, status: done); 1 internal failure, robot
-stopped (stop: the robot has not reported that it stands still; use its remote); 2 bad arguments or robot file; 3
-refused: another bridge owns the socket (stop, arm, release, status: no bridge is running, or none that this user may
-reach; arm: no runner waits, or more than one bridge); 130 interrupted (stop, arm, release, status)"""
+exit codes: 0 ended by a signal or the terminal's end, robot stopped (stop, arm, release, status: done); 1 internal
+failure, robot stopped (stop: the robot has not reported that it stands still; use its remote); 2 bad arguments or robot
+file; 3 refused: another bridge owns the socket (stop, arm, release, status: no bridge is running, or none that this
+user may reach; arm: no runner waits, or more than one bridge); 130 interrupted (stop, arm, release, status)"""
 
 
 class Bridge:
@@ -92,6 +89,7 @@ class Bridge:
         # Only a process that serves needs the protocol's library; a missing one is found before the bridge is ready.
         self._open_backend = backend_opener(config)
         self._robot: Backend = AbsentRobot("")
+        self._join_ns = 0  # when to try again
         with contextlib.ExitStack() as opened:  # what cannot be opened leaves none of the others behind
             self._link = ClientLink(config.bridge.socket, group=groups.runner)
             opened.callback(self._link.close)
@@ -169,13 +167,29 @@ class Bridge:
         if missing is not None:
             self._robot = AbsentRobot(missing)
             return False
-        self._robot = self._open_backend(self._config, self._log.write)
+        # Its threads inherit a lower priority: a flood that keeps them busy must not hold this one on a single core.
+        take_priority(BRIDGE_PRIORITY - 1)
+        try:
+            self._robot = self._open_backend(self._config, self._log.write)
+        finally:
+            take_priority(BRIDGE_PRIORITY)
         settle_memory()
         return True
 
+    def _join_late(self) -> None:
+        """Join a robot whose link has appeared. A device may appear before it can be opened: then try again later."""
+        now_ns = time.monotonic_ns()
+        if now_ns < self._join_ns:
+            return
+        try:
+            if self._join_robot():
+                self._log.write(self.greeting)
+        except LinkOpenError as error:
+            self._join_ns = now_ns + _JOIN_AGAIN_NS
+            self._robot = AbsentRobot(str(error))
+
     def _step(self, *, shutdown: bool = False) -> Outputs:
-        if self._join_robot():
-            self._log.write(self.greeting)
+        self._join_late()
         asleep_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns()
         messages, operator = self._link.receive(), self._operators.receive()
         robot = self._robot.read(time.monotonic_ns())
@@ -250,52 +264,9 @@ def is_pressed(path: Path) -> bool:
         return True
 
 
-def settle_memory() -> None:
-    """Let the garbage collector pass over everything that exists now: later collections visit a step's objects only."""
-    gc.collect()
-    gc.freeze()
-    gc.collect()  # visits nothing; a later one begins at a quarter of the objects that this one visited
-
-
-def take_priority() -> None:
-    """Give this thread, and those that it starts, the installed service's real-time priority where that is permitted.
-
-    The runner's threads have up to one less. A higher priority stays.
-    """
-    is_real_time = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK in (os.SCHED_FIFO, os.SCHED_RR)
-    if is_real_time and os.sched_getparam(0).sched_priority >= BRIDGE_PRIORITY:
-        return
-    with contextlib.suppress(PermissionError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(BRIDGE_PRIORITY))
-
-
-def lock_memory() -> str | None:
-    """Keep this process's pages in memory once touched; why not, in one line, when the system does not permit it."""
-    libc = ctypes.CDLL(None, use_errno=True)
-    if libc.mlockall(_LOCK_PRESENT_FUTURE_ONCE_TOUCHED) == 0:
-        return None
-    error = os.strerror(ctypes.get_errno())
-    return f"memory is not locked ({error}): a page fault may delay a step; LimitMEMLOCK=infinity permits it"
-
-
-@contextlib.contextmanager
-def signals_to_socket() -> Iterator[socket.socket]:
-    """A socket that becomes readable at SIGINT or SIGTERM, so that poll() wakes up."""
-    readable, writable = socket.socketpair()
-    with readable, writable:
-        writable.setblocking(False)
-        signal.set_wakeup_fd(writable.fileno())
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: None)
-        try:
-            yield readable
-        finally:
-            signal.set_wakeup_fd(-1)
-
-
 def serve(config: RobotConfig, latch_path: Path, groups: SocketGroups) -> dict[str, object]:
     """Be the bridge until a signal; the JSON result. Raises what `Bridge` raises."""
-    take_priority()  # first: threads inherit it
+    take_priority(BRIDGE_PRIORITY)  # first: threads inherit it
     with signals_to_socket() as wakeup:
         log = LineLog(sys.stderr, "edge-bridge")
         notifier = Notifier(os.environ)

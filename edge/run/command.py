@@ -228,8 +228,9 @@ def _run(args: argparse.Namespace, say: Callable[[str], None], sessions: list[Ru
     if not artifacts.trained:
         say("the weights of these artifacts are untrained: the robot will move, it will not navigate")
     sessions.append(session)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, on_signal)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:  # nohup asks to stay
+            signal.signal(number, on_signal)
     try:
         result = session.run()
     except StoppedEarlyError as error:

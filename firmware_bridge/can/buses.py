@@ -95,7 +95,10 @@ class FrameBus:
         try:
             for _ in range(most):
                 # `recv` measures its waiting with the wall clock: one that is set back would make it wait.
+                before = self.line_errors
                 message, _ = self._bus._recv_internal(0.0)
+                if message is None and self.line_errors != before:
+                    continue  # what is invalid must not delay what waits behind it
                 if message is None:
                     break
                 frame = as_frame(message)

@@ -19,6 +19,7 @@ from firmware_bridge.can.protection import Crc, Protection
 from firmware_bridge.can.traffic import planned_load
 from firmware_bridge.core.config import RobotConfig
 from firmware_bridge.core.config_can import CanConfig, CanProtection
+from firmware_bridge.core.dangers import TILT_RAD
 from firmware_bridge.core.sections import ConfigError, require
 from firmware_bridge.system.input_file import read_bytes
 
@@ -48,7 +49,12 @@ _MOST: Final = 1e30
 """Bound of every other number of a signal: far above all units, and products of two are still finite."""
 _OURS: Final = ("can.command.", "can.mode.", "can.estop.request")
 _APART: Final = ("can.command.vx", "can.mode.request", "can.estop.request", "can.heartbeat")
-_CYCLIC: Final = ("can.odometry.", "can.wheels.", "can.state.")
+_CYCLIC: Final = (
+    *("can.odometry.", "can.wheels.", "can.state.", "can.imu.", "can.faults["),
+    *("can.estop.button", "can.estop.latched"),
+)
+"""Places whose messages must have a cycle time: without one nobody would notice that they have ceased."""
+_TILTS: Final = ("can.imu.roll", "can.imu.pitch")
 _MOST_BYTES: Final = 8
 _MOST_IDENTIFIER: Final = 0x7FF
 _NS_PER_MS: Final = 1_000_000
@@ -183,7 +189,7 @@ class _Loader:
         if None not in bounds and bounds != (0, 0):  # [0|0] in a DBC file means no range
             assert dbc.minimum is not None and dbc.maximum is not None
             ends = [max(ends[0], _number(dbc.minimum) * factor), min(ends[1], _number(dbc.maximum) * factor)]
-        self._check_size(where, text, dbc, max(map(abs, ends)) + abs(scale) / 2)  # as far as decode() accepts
+        self._check_size(where, text, dbc, max(map(abs, ends)) + abs(scale) / 2, min(-ends[0], ends[1]))
         big = dbc.byte_order == "big_endian"
         return Signal(
             message.name,
@@ -200,11 +206,17 @@ class _Loader:
             kind,
         )
 
-    def _check_size(self, where: str, text: str, dbc: DbcSignal, largest: float) -> None:
-        """Refuse a signal whose values do not fit the datagram that carries them to the runner."""
+    def _check_size(self, where: str, text: str, dbc: DbcSignal, largest: float, reach: float) -> None:
+        """Refuse values that do not fit the datagram to the runner, and tilts that end below the bridge's own limit.
+
+        `largest`: as far as decode() accepts; `reach`: how far the range goes to both sides of 0.
+        """
         if where in _LARGEST:
             most = _LARGEST[where]
             require(largest <= most, f"{where}: {text}: expected a range of at most {most:g}, found {largest:g}")
+        if where in _TILTS:
+            need, found = math.degrees(TILT_RAD), math.degrees(reach)
+            require(reach > TILT_RAD, f"{where}: {text}: expected a range of more than ±{need:g}°, found ±{found:g}°")
         fits = where != "can.state.signal" or dbc.length <= _MOST_STATE_BITS
         require(fits, f"{where}: {text}: expected at most {_MOST_STATE_BITS} bits, found {dbc.length}")
 

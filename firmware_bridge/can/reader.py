@@ -121,6 +121,8 @@ class BaseReader:
         self._agreement = AgreementCheck(config.agreement)
         self._command = (0.0, 0.0)
         self._command_ns = -_COMMANDED_NS - 1
+        self._imu = [where for where in signals if where.startswith("can.imu.")]
+        self._without_value: str | None = None
         self._state: RobotState | None = None
         self._battery: BatteryState | None = None
         self._foreign: str | None = None
@@ -176,7 +178,7 @@ class BaseReader:
             foreign=foreign,
             battery=battery,
             version=self._version(),
-            unsafe=self._invalid() or (None if silent else self._missing(now_ns)),
+            unsafe=self._invalid() or (None if silent else self._missing(now_ns) or self._without_value),
         )
 
     def _check(self, stream: _Stream, frame: Frame, now_ns: int) -> None:
@@ -234,12 +236,14 @@ class BaseReader:
 
     def _built_state(self, passed_s: float, now_ns: int) -> RobotState | None:
         motion = self._wheel_motion(passed_s) if self._config.odometry is None else self._reported_motion()
-        imu, mode = self._config.imu, self._mode()
-        gyro = roll = pitch = None
-        if imu is not None:
-            gyro, roll, pitch = (self._value(f"can.imu.{name}") for name in ("wz", "roll", "pitch"))
-        if motion is None or mode is None:
+        mode = self._mode()
+        if motion is None or mode is None or any(self._signal_data(where) is None for where in self._imu):
             return None
+        gyro, roll, pitch = (self._value(f"can.imu.{name}") for name in ("wz", "roll", "pitch"))
+        invalid = [where for where in self._imu if self._value(where) is None]
+        self.counts.out_of_range += len(invalid)
+        # A tilt that cannot be told is not level.
+        self._without_value = f"{invalid[0]} is outside its range in the DBC file" if invalid else None
         pose, vx, wz = motion
         armed = self._config.state is None or mode == self._config.state.armed
         commanded = self._command if armed and now_ns - self._command_ns <= _COMMANDED_NS else None

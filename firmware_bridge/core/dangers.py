@@ -18,7 +18,7 @@ _STILL_NS: Final = 500_000_000
 _CONFIRM_NS: Final = 200_000_000
 """Time without a report of motion after which a robot counts as still: one report can be a change of direction."""
 _SEEN_NS: Final = 200_000_000  # a report older than this proves nothing about motion
-_TILT_RAD: Final = math.radians(30.0)  # fault matrix row 64
+TILT_RAD: Final = math.radians(30.0)  # fault matrix row 64
 REMOTE_NS: Final = _NS_PER_S  # our choice: a remote counts as in use for this long after its last input
 _COMMANDER_NS: Final = 2 * _NS_PER_S  # twice as long as a Go2 holds a Move
 _BATTERY_NS: Final = 10 * _NS_PER_S  # our choice: ten of the bridge's own battery reads
@@ -78,7 +78,7 @@ class DangerWatch:
             return "second_publisher", f"{self._publishers}: two robots or a forger are on this network"
         if self._writes_fail:
             return "link_down", "the network does not take commands for the robot"
-        if robot is not None and max(abs(robot.roll_rad), abs(robot.pitch_rad)) > _TILT_RAD:
+        if robot is not None and max(abs(robot.roll_rad), abs(robot.pitch_rad)) > TILT_RAD:
             roll, pitch = math.degrees(robot.roll_rad), math.degrees(robot.pitch_rad)
             return "tipped", f"the robot is tipped over or carried (roll {roll:.0f}, pitch {pitch:.0f} degrees)"
         if robot is not None and robot.error_code not in self._safety.accepted_error_codes:

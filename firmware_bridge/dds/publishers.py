@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 
-from firmware_bridge.dds.bus import DDS_ERRORS, DECODE_ERRORS, Bus
+from firmware_bridge.dds.bus import Bus
 
 _FEW: Final = 16  # announcements a step
 _MOST: Final = 64  # publishers kept; a flood of more must not cost memory or time
@@ -26,15 +26,18 @@ class PublisherWatch:
         self._own = str(bus.participant.guid)
         self._allowed = dict(allowed)
         self._topics: dict[str, str] = {}  # GUID of a publisher -> topic
-        self._flooded = False
+        self._flooded = self._unreadable = False
         self._reader: Any = BuiltinDataReader(bus.participant, BuiltinTopicDcpsPublication)
 
     def surplus(self) -> str | None:
         """Take the waiting announcements; return a line about a topic with too many publishers, else None."""
         for _ in range(_FEW):
-            samples: list[Any] = []
-            with contextlib.suppress(*DECODE_ERRORS, *DDS_ERRORS):
+            samples: list[Any] | None = None
+            with contextlib.suppress(Exception):  # the binding raises no narrower one for a name that is not UTF-8
                 samples = self._reader.take(1)
+            if samples is None:  # the announcement is gone, so who it was stays unknown
+                self._unreadable = True
+                continue
             if not samples:
                 break
             self._note(samples[0])
@@ -43,6 +46,8 @@ class PublisherWatch:
             counts[topic] += 1
         if self._flooded:
             return f"more than {_MOST} publishers of the robot's topics; end them, then restart the bridge"
+        if self._unreadable:
+            return "a publisher whose announcement cannot be read; end that program, then restart the bridge"
         for topic, allowed in self._allowed.items():
             if counts[topic] > allowed:
                 return f"{counts[topic]} publishers of {topic}, expected {allowed}"

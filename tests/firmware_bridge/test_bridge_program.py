@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import io
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -16,14 +17,17 @@ from types import SimpleNamespace
 
 import pytest
 
-from firmware_bridge.bridge import Bridge, is_pressed, take_priority
+from firmware_bridge.absent_robot import AbsentRobot
+from firmware_bridge.bridge import Bridge, is_pressed
 from firmware_bridge.bridge import main as bridge_main
 from firmware_bridge.client import BridgeClient, BridgeUnavailable
 from firmware_bridge.client_link import ClientLink, SocketTakenError
 from firmware_bridge.core.config import BRIDGE_PRIORITY, SERVICE_SOCKET, load_robot_config, runtime_dir
 from firmware_bridge.core.link import BridgeStatus
+from firmware_bridge.core.robot_state import LinkOpenError
 from firmware_bridge.system.line_log import LineLog
 from firmware_bridge.system.notify import Notifier
+from firmware_bridge.system.process import take_priority
 from tests.support.processes import GO2_SIM, REPOSITORY
 
 
@@ -106,14 +110,66 @@ def test_the_bridge_takes_its_real_time_priority_and_keeps_a_higher_one(
 ) -> None:
     with monkeypatch.context() as patch:
         scheduling = FakeScheduling(patch, *before)
-        take_priority()
+        take_priority(BRIDGE_PRIORITY)
     assert scheduling.found == after
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [(OURS, (os.SCHED_FIFO, BRIDGE_PRIORITY - 1)), ((os.SCHED_RR, 70), (os.SCHED_RR, 70))],
+)
+def test_the_threads_of_the_robots_link_get_one_less(
+    monkeypatch: pytest.MonkeyPatch, before: tuple[int, int], after: tuple[int, int]
+) -> None:
+    """On a single core a flood that keeps them busy would otherwise hold the thread that stops the robot."""
+    opened: list[tuple[int, int]] = []
+    shell = Bridge.__new__(Bridge)
+    shell._config, shell._robot = load_robot_config(GO2_SIM), AbsentRobot("late")
+    shell._log = SimpleNamespace(write=print)  # type: ignore
+    with monkeypatch.context() as patch:
+        scheduling = FakeScheduling(patch, *before)
+        shell._open_backend = lambda *_: opened.append(scheduling.found) or AbsentRobot("")  # type: ignore
+        shell._join_robot()
+    assert opened == [after] and scheduling.found == before
+
+
+def test_a_link_that_appears_before_it_can_be_opened_is_tried_again_each_second(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A serial device appears as root's alone, before udev gives it to its group."""
+    now_ns, tried_ns = [0], []
+
+    def denied() -> bool:
+        tried_ns.append(now_ns[0])
+        raise LinkOpenError("serial device /dev/ttyACM0: Permission denied")
+
+    shell = Bridge.__new__(Bridge)
+    shell._join_ns, shell._robot, shell._join_robot = 0, AbsentRobot("missing"), denied  # type: ignore
+    with monkeypatch.context() as patch:
+        patch.setattr(time, "monotonic_ns", lambda: now_ns[0])
+        for _ in range(110):
+            shell._join_late()
+            now_ns[0] += 20_000_000
+    assert tried_ns == [0, 10**9, 2 * 10**9]
+    assert shell._robot.reason == "serial device /dev/ttyACM0: Permission denied"  # type: ignore
+
+
+def test_a_bridge_under_nohup_stays_when_its_terminal_is_closed() -> None:
+    script = (
+        "import os, signal; from firmware_bridge.system.process import signals_to_socket\n"
+        "signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
+        "with signals_to_socket() as wakeup:\n"
+        "    os.kill(os.getpid(), signal.SIGHUP); os.kill(os.getpid(), signal.SIGTERM)\n"
+        "    print(*wakeup.recv(9))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=REPOSITORY, check=True)
+    assert done.stdout.split() == [str(int(signal.SIGTERM))]
 
 
 def test_a_bridge_without_the_right_to_a_priority_runs_without_one(monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         scheduling = FakeScheduling(patch, os.SCHED_OTHER, 0, permitted=False)
-        take_priority()
+        take_priority(BRIDGE_PRIORITY)
     assert scheduling.found == (os.SCHED_OTHER, 0)
 
 

@@ -135,6 +135,9 @@ WIDE_STATE = """ SG_ State : 12|33@1+ (1,0) [0|2] "" Controller
  SG_ Uptime : 48|8@1+ (0.001,0) [0|0] "s" Controller"""
 DBC_CHANGES = [
     ('"GenMsgCycleTime" BO_ 544 20', '"GenMsgCycleTime" BO_ 544 0', "OdometryPosition: expected a GenMsgCycleTime"),
+    ('"GenMsgCycleTime" BO_ 560 10', '"GenMsgCycleTime" BO_ 560 0', "ImuGyro: expected a GenMsgCycleTime"),
+    ('"GenMsgCycleTime" BO_ 32 100', '"GenMsgCycleTime" BO_ 32 0', "EstopState: expected a GenMsgCycleTime"),
+    ('"GenMsgCycleTime" BO_ 592 100', '"GenMsgCycleTime" BO_ 592 0', "Faults: expected a GenMsgCycleTime"),
     ("BO_ 544 OdometryPosition: 8 Base", "BO_ 2147484192 OdometryPosition: 8 Base", "expected a CAN 2.0A message"),
     ("BO_ 272 VelocityCommand: 6 Controller", "BO_ 272 VelocityCommand: 6 Base", "expected Controller as its sender"),
     (VX, '(0.001,0) [-0.1|0.1] "m/s" Base', "expected a range of at least -0.4"),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import socket
+import struct
 import termios
 import time
 from collections.abc import Iterator
@@ -14,6 +16,7 @@ import pytest
 
 from firmware_bridge.can.buses import BusAddress, BusError, FrameBus, open_bus
 from firmware_bridge.can.frame import Frame
+from firmware_bridge.can.multicast import PORT
 from firmware_bridge.can.robot_link import RobotLink
 from firmware_bridge.can.serial_line import SerialLine
 from firmware_bridge.can.table import missing_link
@@ -138,6 +141,22 @@ class Echoing:
 
     def _recv_internal(self, timeout: float) -> tuple[can.Message | None, bool]:
         return (self.waiting.pop(0) if self.waiting else None), False
+
+
+def test_invalid_datagrams_do_not_delay_the_frame_behind_them() -> None:
+    address = BusAddress("udp_multicast", "239.74.163.77")
+    ours, base = (FrameBus(open_bus(address), echoes=True) for _ in range(2))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        loopback = struct.pack("@4s4si", bytes(4), bytes(4), socket.if_nametoindex("lo"))
+        other.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, loopback)
+        for _ in range(20):
+            other.sendto(b"x", (address.channel, PORT))
+    base.send(Frame(0x1B1, b"\x90"))
+    try:
+        assert ours.receive(64) == [Frame(0x1B1, b"\x90")] and ours.line_errors == 20
+    finally:
+        ours.close()
+        base.close()
 
 
 def test_a_frame_that_comes_back_from_our_own_bus_is_not_another_controllers() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import signal
@@ -16,12 +17,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cyclonedds.internal import DDS
+from cyclonedds.qos import Policy, Qos, _CQos
 
 from firmware_bridge.bridge import main as bridge_main
 from firmware_bridge.client import BridgeClient, BridgeUnavailable
 from firmware_bridge.operate import operate
 from firmware_bridge.unitree.messages import ids
+from firmware_bridge.unitree.messages.idl import WirelessController_
 from firmware_bridge.unitree.rpc import RpcClient, move_parameter
+from tests.process.bridge.stop_rig import Peer
 from tests.support.notify_socket import notify_socket
 from tests.support.processes import GO2_SIM, REPOSITORY, HostStall, Running, check_stop_latency, running, wait_for
 from tests.support.robot.fake_go2 import FakeGo2
@@ -185,6 +190,39 @@ def test_a_second_commander_gets_the_robot_zeroed_and_the_bridge_latched(
         rogue.send(ids.MOVE, move_parameter(0.7, 0.0, 0.0), noreply=True)
         check_lasting_zero(robot, since_ns, 500_000_000, host)
     assert "another client commands the robot (sport 1008)" in bridge.stderr()
+
+
+def test_a_publisher_whose_announcement_cannot_be_read_stops_the_robot(
+    robot: FakeGo2, bridge: Running, drive: Drive, dds_domain: int, socket_path: Path
+) -> None:
+    """The binding decodes no name that is not UTF-8; the bridge once ended at every start while the writer lived."""
+    peer = Peer(dds_domain)
+    with HostStall() as host, drive():
+        since_ns = time.monotonic_ns()
+        qos = _CQos.qos_to_cqos(Qos(Policy.Reliability.BestEffort))
+        DDS._dll_handle.dds_qset_entity_name(qos, ctypes.c_char_p(b"\xff"))
+        topic = peer._topic("rt/unrelated", WirelessController_)
+        DDS._dll_handle.dds_create_writer(peer.participant._ref, topic._ref, qos, None)
+        check_lasting_zero(robot, since_ns, 500_000_000, host)
+    peer.close()
+    assert operate("status", socket_path)[1]["blocked_by"] == "second_publisher"
+
+
+LEAVING = (signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP, signal.SIGXCPU)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", LEAVING, ids=[number.name for number in LEAVING])
+def test_a_signal_leaves_a_stopped_robot(
+    robot: FakeGo2, bridge: Running, drive: Drive, socket_path: Path, number: signal.Signals
+) -> None:
+    """Among them a closed terminal, Ctrl-\\, Ctrl-Z, and too much computing without a pause."""
+    with HostStall() as host, drive():
+        since_ns = time.monotonic_ns()
+        bridge.process.send_signal(number)
+        check_lasting_zero(robot, since_ns, 60_000_000, host)
+        assert bridge.process.wait(5) == 0 and not socket_path.exists()
+    assert any(command.api_id == ids.STOP_MOVE for command in robot.received)
 
 
 @pytest.mark.slow

@@ -206,11 +206,12 @@ class DbcBase:
 
 
 def virtual(path: Path, **changes: object) -> RobotConfig:
-    """A robot file on a new virtual bus, with other values in [can]."""
+    """A robot file on a new virtual bus, with other values in [can]; its runner arms by itself."""
     config = load_robot_config(path)
     assert config.can is not None
     channel = f"tests-{next(_CHANNELS)}"
-    return replace(config, can=replace(config.can, interface="virtual", channel=channel, **changes))
+    settings = replace(config.can, interface="virtual", channel=channel, **changes)
+    return replace(config, can=settings, safety=replace(config.safety, operator_arm=False))
 
 
 class CanRig:

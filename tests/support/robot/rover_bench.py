@@ -47,10 +47,11 @@ def lost(packet: bytes) -> Iterable[bytes]:
 
 
 def robot_file(path: Path = CARTER, **changes: object) -> RobotConfig:
-    """A robot file with other values in [mavlink]."""
+    """A robot file with other values in [mavlink]; its runner arms by itself."""
     config = load_robot_config(path)
     assert config.mavlink is not None
-    return replace(config, mavlink=replace(config.mavlink, **changes))
+    safety = replace(config.safety, operator_arm=False)
+    return replace(config, mavlink=replace(config.mavlink, **changes), safety=safety)
 
 
 class RoverBench:
