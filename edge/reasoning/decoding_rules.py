@@ -68,6 +68,7 @@ EARLIER_NS: Final = 3_000_000_000
 """Longest time by which a turn may begin before the text names it as the next one."""
 SETTLED_RAD: Final = 0.09
 """Yaw change below which a turn counts as finished, rad (5° in 1 s)."""
+QUARTER_RAD: Final = math.pi / 2
 SECOND_NS: Final = 1_000_000_000
 MAX_REFUSALS: Final = 6
 """Number of claims in a row after which a turn counts as done."""
@@ -361,6 +362,7 @@ class _Rotation:
         """`settling`: side of the previous turn, which the robot may still be making from `from_ns` on."""
         self._settling, self._from_ns = settling, from_ns
         self._recent: deque[tuple[int, float]] = deque()
+        self._first_rad = {LEFT: math.inf, RIGHT: math.inf}
         self._start_rad = {LEFT: math.inf, RIGHT: math.inf}
         self._now_rad = {LEFT: 0.0, RIGHT: 0.0}
         self._most_rad = {LEFT: 0.0, RIGHT: 0.0}
@@ -375,8 +377,12 @@ class _Rotation:
         if self._from_ns <= then_ns <= stamp_ns - SECOND_NS and abs(heading_rad - then_rad) < SETTLED_RAD:
             self._settling = None
         for side, aside_rad in ((LEFT, heading_rad), (RIGHT, -heading_rad)):
-            # During the previous turn, this one begins at the present heading.
-            start_rad = aside_rad if side == self._settling else min(self._start_rad[side], aside_rad)
+            if self._first_rad[side] == math.inf and stamp_ns >= self._from_ns:
+                self._first_rad[side] = aside_rad
+            # During the previous turn, this one begins at the present heading, but no later than after 90° of that
+            # turn: a robot that turns round a rack makes two without a pause.
+            begun_rad = self._first_rad[side] + QUARTER_RAD if side == self._settling else self._start_rad[side]
+            start_rad = min(begun_rad, aside_rad)
             self._start_rad[side], self._now_rad[side] = start_rad, aside_rad - start_rad
             self._most_rad[side] = max(self._most_rad[side], aside_rad - start_rad)
             if self._most_rad[side] >= ONCE_TURNED_RAD:

@@ -162,7 +162,10 @@ def test_frozen_while_driving_the_robot_gets_zero_within_300_ms_and_old_commands
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 0)])
+@pytest.mark.parametrize(
+    ("number", "status"),
+    [(signal.SIGINT, 130), (signal.SIGTERM, 0), pytest.param(signal.SIGHUP, 0, marks=pytest.mark.slow)],
+)
 def test_a_signal_ends_the_run_with_the_robot_standing_still(robot: Robot, number: int, status: int) -> None:
     result = robot.folder / "run.json"
     with drive(robot, "--json", result) as runner:

@@ -238,6 +238,17 @@ def test_the_rest_of_a_turn_is_not_the_next_one_to_the_same_side(sides: list[str
     assert estimator.may_be_done
 
 
+def test_two_turns_to_the_same_side_without_a_pause_are_both_made() -> None:
+    """Round the end of a rack; the second turn was refused before until its text had claimed it six times."""
+    estimator = before_turn()
+    second = rotate(estimator, SLOWLY[:18], second=2.0)
+    observe(estimator, NEXT, TurnObservation("left", 2.0), second=second - 0.1)
+    second = rotate(estimator, [54.0 + heading for heading in SLOWLY[:24]], second=second)
+    assert not estimator.may_be_done
+    rotate(estimator, [126.0 + heading for heading in SLOWLY[:18]], second=second)
+    assert estimator.may_be_done
+
+
 @pytest.mark.parametrize(("side", "sign"), [("left", 1), ("right", -1)])
 def test_the_next_turn_may_begin_as_soon_as_it_is_named(side: str, sign: int) -> None:
     """To the same side once the turn before has ended, to the other side at once."""
