@@ -6,7 +6,7 @@ Openings are counted as the instruction's ordinals count them: before "the third
 from __future__ import annotations
 
 import itertools
-from math import hypot
+from math import atan2, hypot
 from typing import Final
 
 import numpy as np
@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse.csgraph import dijkstra
 
-from edge.core.geometry import SE2
-from edge.state.reasoning_text import Progress
+from edge.core.geometry import SE2, wrap_angle
+from edge.reasoning.decoding_rules import TURNED_RAD
+from edge.state.reasoning_text import LEFT, Progress
 from sim_hil.benchmark.language.openings import Frame
 from sim_hil.benchmark.language.route import Step
 from sim_hil.scene.nav_grid import NavGrid
@@ -95,8 +96,8 @@ class RouteProgress:
         if index and (place - self._at[index - 1]) * _SPACING_M < _TURNED_M:
             step = self._steps[index - 1]
             area = self._scene.area_at(pose.x_m, pose.y_m)
-            before = self._area_before(index - 1)
-            if step.side != "straight" and area is not None and area.label == before:
+            here = area is not None and area.label == self._area_before(index - 1)
+            if step.side != "straight" and (here or not _has_turned(step, pose)):
                 index -= 1
         return index
 
@@ -146,6 +147,12 @@ class RouteProgress:
         last = self._at[index] if index < len(self._steps) else len(self._points)
         found = (self._scene.area_at(float(x), float(y)) for x, y in self._points[first:last])
         return frozenset(area.label for area in found if area is not None)
+
+
+def _has_turned(step: Step, pose: SE2) -> bool:
+    """Return whether the robot heads so far to the side of a turn that the runner's rule lets it be done."""
+    rotated_rad = wrap_angle(pose.theta_rad - atan2(step.ahead[1], step.ahead[0]))
+    return (rotated_rad if step.side == LEFT else -rotated_rad) >= TURNED_RAD
 
 
 def _dense(path: tuple[Vec2, ...]) -> Array:
