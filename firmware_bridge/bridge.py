@@ -37,7 +37,7 @@ from firmware_bridge.system.latch_file import LatchFile, read_latch
 from firmware_bridge.system.line_log import LineLog
 from firmware_bridge.system.notify import Notifier
 from firmware_bridge.system.output_file import check_output, write_descriptor, write_output
-from firmware_bridge.system.process import lock_memory, settle_memory, signals_to_socket, take_priority
+from firmware_bridge.system.process import lock_memory, settle_memory, signals_to_socket
 from firmware_bridge.system.terminal import CommandParser, one_line
 
 _OPERATORS: Final = 4  # at a time
@@ -262,6 +262,18 @@ def is_pressed(path: Path) -> bool:
             os.close(file)
     except OSError:
         return True
+
+
+def take_priority(priority: int) -> None:
+    """Give this thread, and those that it starts, a real-time priority where that is permitted.
+
+    The installed service's is BRIDGE_PRIORITY, the runner's threads have less. A priority above it stays.
+    """
+    is_real_time = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK in (os.SCHED_FIFO, os.SCHED_RR)
+    if is_real_time and os.sched_getparam(0).sched_priority > BRIDGE_PRIORITY:
+        return
+    with contextlib.suppress(PermissionError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
 
 
 def serve(config: RobotConfig, latch_path: Path, groups: SocketGroups) -> dict[str, object]:

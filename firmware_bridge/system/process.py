@@ -1,4 +1,4 @@
-"""What the bridge asks of the system for its own process: priority, memory that stays, signals that poll() sees."""
+"""What the bridge asks of the system for its own process: memory that stays, signals that poll() sees."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ import socket
 from collections.abc import Iterator
 from typing import Final
 
-from firmware_bridge.core.config import BRIDGE_PRIORITY
-
 _LOCK_PRESENT_FUTURE_ONCE_TOUCHED: Final = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT of <sys/mman.h>
 _LEAVE: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP, signal.SIGXCPU)
 """Signals that end the bridge with the robot stopped, also a closed terminal, Ctrl-Z and LimitRTTIME's warning."""
@@ -23,18 +21,6 @@ def settle_memory() -> None:
     gc.collect()
     gc.freeze()
     gc.collect()  # visits nothing; a later one begins at a quarter of the objects that this one visited
-
-
-def take_priority(priority: int) -> None:
-    """Give this thread, and those that it starts, a real-time priority where that is permitted.
-
-    The installed service's is BRIDGE_PRIORITY, the runner's threads have less. A priority above it stays.
-    """
-    is_real_time = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK in (os.SCHED_FIFO, os.SCHED_RR)
-    if is_real_time and os.sched_getparam(0).sched_priority > BRIDGE_PRIORITY:
-        return
-    with contextlib.suppress(PermissionError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
 
 
 def lock_memory() -> str | None:

@@ -18,7 +18,7 @@ from types import SimpleNamespace
 import pytest
 
 from firmware_bridge.absent_robot import AbsentRobot
-from firmware_bridge.bridge import Bridge, is_pressed
+from firmware_bridge.bridge import Bridge, is_pressed, take_priority
 from firmware_bridge.bridge import main as bridge_main
 from firmware_bridge.client import BridgeClient, BridgeUnavailable
 from firmware_bridge.client_link import ClientLink, SocketTakenError
@@ -27,7 +27,6 @@ from firmware_bridge.core.link import BridgeStatus
 from firmware_bridge.core.robot_state import LinkOpenError
 from firmware_bridge.system.line_log import LineLog
 from firmware_bridge.system.notify import Notifier
-from firmware_bridge.system.process import take_priority
 from tests.support.processes import GO2_SIM, REPOSITORY
 
 
