@@ -18,6 +18,8 @@ from firmware_bridge.core.config import LimitsConfig
 TARGET_TIME_S = 1.0
 TURN_IN_PLACE_M = 0.05
 """Distance below which a target's direction is ignored and only its heading is followed, m."""
+STEER_M = 0.25
+"""Distance from which only its direction is followed, m: that of a robot that hardly moves is noise."""
 MAX_STEP_S = 0.2
 
 
@@ -61,16 +63,21 @@ class VelocityCommand:
 
 
 def arc_to(target: SE2, time_s: float) -> tuple[float, float]:
-    """Return speed (m/s) and yaw rate (rad/s) of the arc, tangent to x, that meets the target in `time_s`."""
+    """Return speed (m/s) and yaw rate (rad/s) of the arc, tangent to x, that meets the target in `time_s`.
+
+    The arc's end has twice the target's bearing as its heading; the nearer the target, the more its own heading counts.
+    """
     distance_m = math.hypot(target.x_m, target.y_m)
     if distance_m < TURN_IN_PLACE_M:
         return 0.0, target.theta_rad / time_s
     bearing = math.atan2(target.y_m, target.x_m)
-    if abs(bearing) > math.pi / 2:
-        # Turn towards a point behind instead of reversing: the camera faces forward.
-        return 0.0, math.copysign(math.pi / 2, bearing) / time_s
-    arc_m = distance_m if abs(bearing) < 1e-6 else distance_m * bearing / math.sin(bearing)
-    return arc_m / time_s, 2 * bearing / time_s
+    arc_m, turn_rad = 0.0, math.copysign(math.pi / 2, bearing)
+    # A point behind is turned to instead of reversed to: the camera faces forward.
+    if abs(bearing) <= math.pi / 2:
+        arc_m = distance_m if abs(bearing) < 1e-6 else distance_m * bearing / math.sin(bearing)
+        turn_rad = 2 * bearing
+    share = min((distance_m - TURN_IN_PLACE_M) / (STEER_M - TURN_IN_PLACE_M), 1.0)
+    return arc_m / time_s, (share * turn_rad + (1.0 - share) * target.theta_rad) / time_s
 
 
 def is_plan(trajectory: npt.NDArray[np.float32]) -> bool:

@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from edge.core.geometry import SE2
 from edge.motion.controller import (
+    STEER_M,
     TURN_IN_PLACE_M,
     Controller,
     ControllerConfig,
@@ -66,7 +67,7 @@ def test_a_straight_plan_is_driven_at_its_own_speed() -> None:
 
 @given(st.floats(0.06, 2.0), st.floats(-1.5, 1.5))
 def test_the_arc_meets_its_target(distance: float, bearing: float) -> None:
-    target = SE2(distance * math.cos(bearing), distance * math.sin(bearing), 0.0)
+    target = SE2(distance * math.cos(bearing), distance * math.sin(bearing), 2 * bearing)
     speed, yaw_rate = arc_to(target, 1.0)
     if abs(yaw_rate) < 1e-9:
         x, y = speed, 0.0
@@ -217,8 +218,22 @@ def test_in_twice_the_time_an_arc_needs_half_the_velocities(x: float, y: float, 
 
 
 def test_a_target_at_the_turning_distance_is_driven_to_and_a_nearer_one_only_turned_to() -> None:
-    assert arc_to(SE2(TURN_IN_PLACE_M, 0.0, 0.3), 1.0) == (TURN_IN_PLACE_M, 0.0)
+    assert arc_to(SE2(TURN_IN_PLACE_M, 0.0, 0.3), 1.0) == (TURN_IN_PLACE_M, 0.3)
     assert arc_to(SE2(TURN_IN_PLACE_M * 0.999, 0.0, 0.3), 1.0) == (0.0, 0.3)
+
+
+@given(st.floats(STEER_M, 4.0), st.floats(-math.pi, math.pi), st.floats(-3, 3), st.floats(-3, 3))
+def test_far_targets_are_steered_to_whatever_their_heading(d: float, bearing: float, one: float, other: float) -> None:
+    xy = d * math.cos(bearing), d * math.sin(bearing)
+    assume(math.hypot(*xy) >= STEER_M)
+    assert arc_to(SE2(*xy, one), 1.0) == arc_to(SE2(*xy, other), 1.0)
+
+
+@given(st.floats(-math.pi, math.pi), st.floats(-math.pi, math.pi), st.floats(-3, 3))
+def test_the_direction_of_a_robot_that_hardly_moves_hardly_turns_it(one: float, other: float, theta: float) -> None:
+    """Else noise of some centimetres commands full turns to alternating sides, and the run stands for oscillation."""
+    turns = [arc_to(SE2(0.07 * math.cos(b), 0.07 * math.sin(b), theta), 1.0)[1] for b in (one, other)]
+    assert abs(turns[0] - turns[1]) <= 0.1 * 2 * math.pi + 1e-9
 
 
 @pytest.mark.parametrize("side", [1, -1])

@@ -24,7 +24,7 @@ from edge.inference.generation_task import GenerationModels
 from edge.inference.graph import Interrupt
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
-from edge.motion.controller import TARGET_TIME_S, TURN_IN_PLACE_M
+from edge.motion.controller import STEER_M, TARGET_TIME_S, TURN_IN_PLACE_M
 from edge.reasoning.generation_cycle import Mode, ReasoningConfig
 from edge.run.assembly import semantic_config
 from edge.safety.monitors.semantic import SemanticMonitor
@@ -157,10 +157,10 @@ def arc_command(trajectory: Tensor, step_s: float) -> Tensor:
     near, behind = distance < TURN_IN_PLACE_M, bearing.abs() > math.pi / 2
     still = near | behind
     speed = torch.where(still, torch.zeros_like(distance), distance * stretch / TARGET_TIME_S)
-    turn = 2 * bearing / TARGET_TIME_S
-    turn = torch.where(behind, torch.sign(bearing) * (math.pi / 2) / TARGET_TIME_S, turn)
-    turn = torch.where(near, theta / TARGET_TIME_S, turn)
-    return torch.stack([speed, turn], dim=-1)
+    turn = torch.where(behind, torch.sign(bearing) * (math.pi / 2), 2 * bearing)
+    share = ((distance - TURN_IN_PLACE_M) / (STEER_M - TURN_IN_PLACE_M)).clamp(0.0, 1.0)
+    turn = share * turn + (1 - share) * theta
+    return torch.stack([speed, turn / TARGET_TIME_S], dim=-1)
 
 
 def within_limits(arc: Tensor, limits: CommandLimits) -> Tensor:
