@@ -243,7 +243,8 @@ class DriftEstimator:
         pictures = np.reshape(seen.covariance, (3, 3))
         visual = pictures + self._mistimed(inside)
         by = np.zeros((3, pose_chain.PARAMETERS))
-        by[0, VISUAL], by[1, VISUAL] = seen.T_start_end.x_m, seen.T_start_end.y_m
+        # By the odometry's motion, not the seen one: its noise, also in the innovation, would raise both scales for ever.
+        by[:2, VISUAL] = interval.motion[:2]
         observed = np.array(seen.T_start_end.as_tuple())
         observed[:2] /= 1.0 + self._visual_scale
         innovation = observed - interval.motion
