@@ -243,7 +243,7 @@ class DriftEstimator:
         pictures = np.reshape(seen.covariance, (3, 3))
         visual = pictures + self._mistimed(inside)
         by = np.zeros((3, pose_chain.PARAMETERS))
-        # By the odometry's motion, not the seen one: its noise, also in the innovation, would raise both scales for ever.
+        # By the odometry's motion: the noise of the seen one, also in the innovation, would raise both scales for ever.
         by[:2, VISUAL] = interval.motion[:2]
         observed = np.array(seen.T_start_end.as_tuple())
         observed[:2] /= 1.0 + self._visual_scale
