@@ -48,7 +48,7 @@ _LAST_ZEROS: Final = 5  # ticks of zeros between a signal and the exit
 _LATE_NS: Final = 50_000_000  # a step this late is no sign of life for the watchdog
 _PAUSE_NS: Final = 1_000_000
 """Pause after each step, ns: a client that floods a socket must not keep a bridge of real-time priority from sleeping,
-because LimitRTTIME kills it then. Far below every bound on a stop."""
+because LimitRTTIME ends it then. Far below every bound on a stop."""
 _STARTING_S: Final = 20.0  # the unit's TimeoutStartSec, which moves on while the bridge waits for its interface
 _EXTEND_NS: Final = 5_000_000_000
 
