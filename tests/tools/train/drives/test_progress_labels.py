@@ -11,6 +11,7 @@ import pytest
 from edge.core.geometry import SE2
 from edge.state.reasoning_text import Progress
 from sim_hil.benchmark.language.openings import Frame
+from sim_hil.benchmark.language.route import Step
 from sim_hil.benchmark.policies.expert_route import RoutePlanner
 from tests.support.train.training_scenarios import all_scenarios, progress_of, scenarios
 from tools.train.config.collect import CORRIDOR, KINDS
@@ -36,6 +37,11 @@ def _expert_way(scenario: Scenario) -> Points:
     planner = RoutePlanner(ground, episode.goal_xy, 0.8 * episode.threshold_m)
     line = planner.route(episode.start[:2], np.zeros((0, 2)), 150.0)
     return [(float(x), float(y)) for x, y in line]
+
+
+def _index_of(step: Step, points: Points) -> int:
+    """Index of the point that is nearest to a step's turn."""
+    return min(range(len(points)), key=lambda i: hypot(points[i][0] - step.at[0], points[i][1] - step.at[1]))
 
 
 def _said(progress: RouteProgress, points: Points) -> list[Progress]:
@@ -70,7 +76,7 @@ def test_a_turn_is_done_once_the_robot_has_turned_by_25_degrees_or_is_a_metre_pa
     for scenario in all_scenarios():
         progress, way = progress_of(scenario), _told_way(scenario)
         for index, step in enumerate(scenario.route.steps):
-            turn = min(range(len(way)), key=lambda i: hypot(way[i][0] - step.at[0], way[i][1] - step.at[1]))
+            turn = _index_of(step, way)
             if step.side == "straight" or turn + 12 >= len(way):
                 continue
             ahead_rad, sign = atan2(step.ahead[1], step.ahead[0]), 1 if step.side == "left" else -1
@@ -100,7 +106,7 @@ def test_a_robot_that_misses_the_turn_keeps_it_as_next_and_counts_the_opening() 
             if not step.counted or step.before_kind not in ("corridor", "aisle"):
                 continue
             frame, taken = Frame(step.ahead), step.counted[step.ordinal - 1]
-            turn = min(range(len(way)), key=lambda i: hypot(way[i][0] - step.at[0], way[i][1] - step.at[1]))
+            turn = _index_of(step, way)
             x, y = frame.point(taken.high_m + 0.6, frame.across(way[max(0, turn - 8)]))
             said = progress.at(SE2(x, y, 0.0))
             if scenario.site.grid.clearance_m(x, y) < 0.2 or progress.strayed_m(SE2(x, y, 0.0)) > 4.0:
