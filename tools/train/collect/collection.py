@@ -198,7 +198,7 @@ def _record(job: StageJob, writer: DatasetWriter, collection: Collection) -> Non
 
 
 FOLDER: Final = "tours"
-FORMAT: Final = 6
+FORMAT: Final = 7
 PREFIX: Final = "w"
 _TURN: Final = 500
 """Collection number of tours: DAgger rounds use those from 0 on, their experts those from 1000 on."""

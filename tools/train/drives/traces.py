@@ -57,8 +57,11 @@ _WAIT_M: Final = 0.5  # a planned position in 3 s within this distance counts as
 _WAIT_FOR_M: Final = 2.5  # the robot waits only for a person within this distance
 _INSIDE_M: Final = 0.2  # depth inside an opening of the point whose visibility is tested
 _BACK_M: Final = -0.3  # a planned x in 3 s below this counts as turning back
+_ASIDE_RAD: Final = radians(60.0)  # off the route, so does a planned bearing beyond this that no near turn explains
+_NEAR_TURN_M: Final = 3.0  # largest distance of a turn that explains it
 _ROUND_RAD: Final = 2.0  # the expert usually turns around for targets beyond this bearing
 _AGAINST: Final = -0.5  # cosine between a heading and a leg's direction below which the robot drives the leg backwards
+_BESIDE_M: Final = 1.0  # up to this walking distance to the route, the robot drives beside it and is not off it
 _HERE_M: Final = 0.05  # a planned position within this distance means staying
 _ON_M: Final = 2.0  # x in 3 s that is assumed without a plan: the robot drives on
 _EYES_M: Final = {"go2": EYE_M, "carter": MOUNTS["carter"].position_m[2]}  # camera height; the Go2's while standing
@@ -123,7 +126,7 @@ class Tracer:
         plan = Plan(Stop(plan_metres(left_m)))
         if step is not None:
             plan = Plan(Turn(_seen_side(step, backwards=backwards), step.kind, plan_metres(left_m)))
-        if x_m < _BACK_M or (missed and not backwards):
+        if x_m < _BACK_M or (missed and not backwards) or self._returns(pose, (x_m, y_m), plan):
             plan = Plan(TurnBack())
         elif ahead and (hypot(x_m, y_m) if driven_m is None else driven_m) < _WAIT_M:
             plan = replace(plan, waits=True)
@@ -141,6 +144,15 @@ class Tracer:
     def off_m(self, pose: SE2) -> float:
         """Return the walking distance to the route, m, rounded as a drive's header has it."""
         return round(self.progress.strayed_m(pose), 1)
+
+    def _returns(self, pose: SE2, point: Vec2, plan: Plan) -> bool:
+        """Return whether a robot off its route is to head back to it, which the plan does not say."""
+        bearing_rad, action = atan2(point[1], point[0]), plan.action
+        if abs(bearing_rad) <= _ASIDE_RAD or self.progress.strayed_m(pose) <= _BESIDE_M:
+            return False
+        if isinstance(action, TurnBack) or action.distance_m > _NEAR_TURN_M:
+            return True
+        return isinstance(action, Turn) and action.side != (LEFT if bearing_rad > 0 else RIGHT)
 
     def _people_in_view(self, pose: SE2, people: Array) -> list[tuple[int, float]]:
         """Return indices and distances, m, of people in view within PEOPLE_M, nearest first."""

@@ -165,6 +165,26 @@ def test_past_a_missed_opening_the_plan_is_to_turn_back_and_then_to_turn_to_the_
     assert checked >= 3
 
 
+@pytest.mark.slow
+def test_off_the_route_the_plan_is_to_turn_back_to_a_point_aside_unless_a_near_turn_leads_there() -> None:
+    scenario = scenarios("office")[0]
+    tracer, aside = _tracer(scenario), [(0.2, 2.0)]
+    found = {False: 0, True: 0}
+    (x0, y0), (x1, y1) = scenario.scene.floor_min_m, scenario.scene.floor_max_m
+    places = itertools.product(np.arange(x0, x1, 1.0), np.arange(y0, y1, 1.0))
+    for pose in (SE2(float(x), float(y), 0.0) for x, y in places if scenario.site.grid.is_free(x, y)):
+        explained = tracer.trace(pose, *NOBODY, AHEAD).plan
+        assert explained is not None
+        action = explained.action
+        if isinstance(action, TurnBack):
+            continue
+        near_left = action.distance_m <= 3 and (isinstance(action, Stop) or action.side == "left")
+        returns = tracer.progress.strayed_m(pose) > 1.0 and not near_left
+        assert tracer.trace(pose, *NOBODY, aside).plan == (Plan(TurnBack()) if returns else explained)
+        found[returns] += 1
+    assert min(found.values()) >= 5
+
+
 def test_stepping_back_from_a_person_is_not_turning_back() -> None:
     scenario = scenarios(CORRIDOR)[0]
     pose = SE2(5.0, -0.2, 0.0)
