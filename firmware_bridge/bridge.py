@@ -105,7 +105,9 @@ class Bridge:
         latch = read_latch(latch_path)
         self._latch_file = LatchFile(latch_path, log.write)
         table = robot_table(config)
-        self._core = BridgeCore(config.bridge, config.limits, config.safety, table, time.monotonic_ns(), latch=latch)
+        self._core = BridgeCore(
+            config.bridge, config.limits, config.safety, table, time.monotonic_ns(), latch=latch, robot=config.digest
+        )
         self._period_ns = 1_000_000_000 // config.bridge.rate_hz
         self._wake_ns = self._pinged_ns = time.monotonic_ns()
         self._reported, self._ready, self._extended_ns = "", False, -_EXTEND_NS

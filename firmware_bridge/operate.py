@@ -81,7 +81,7 @@ def operate(command: str, *sockets: Path, say: Say = _write) -> tuple[int, dict[
     if command == "arm":
         answers |= _at_each(command, say, *reached)
     missing = [answer for answer in answers.values() if isinstance(answer, BridgeUnavailable)]
-    hidden = [answer for answer in missing if _is_hidden(answer)]
+    hidden = [answer for answer in missing if _is_hidden(answer) or (command == "stop" and _has_died(answer))]
     unconfirmed = [answer for answer in answers.values() if isinstance(answer, Unconfirmed)]
     statuses = [answer for answer in answers.values() if isinstance(answer, BridgeStatus)]
     if len(missing) == len(answers):
@@ -93,7 +93,8 @@ def operate(command: str, *sockets: Path, say: Say = _write) -> tuple[int, dict[
     if command == "arm" and any(status.permit == "not needed" for status in statuses):
         say("no permission is needed: the runner arms by itself")
     for error in hidden:
-        say(one_line(error))
+        died = f"; its robot is NOT stopped: {_USE_REMOTE}, then remove that file" if _has_died(error) else ""
+        say(f"{one_line(error)}{died}")
     for answer in unconfirmed:
         say(_why_unconfirmed(command, answer.status))
     values = statuses[0] if statuses else next((answer.status for answer in unconfirmed if answer.status), None)
@@ -123,6 +124,11 @@ def _is_hidden(error: BridgeUnavailable) -> bool:
     return not isinstance(error.__cause__, (FileNotFoundError, ConnectionRefusedError))
 
 
+def _has_died(error: BridgeUnavailable) -> bool:
+    """Whether a bridge ended without removing its socket: its robot may still move."""
+    return isinstance(error.__cause__, ConnectionRefusedError)
+
+
 def _at_each(command: str, say: Say, *sockets: Path) -> dict[Path, Answer]:
     """Send to all sockets at the same time: a bridge that hangs must not delay another one's stop."""
     if not sockets:
@@ -144,7 +150,7 @@ def _operate(command: str, say: Say, socket: Path) -> Answer:
             finally:
                 client.close()
         except BridgeUnavailable as error:
-            absent = isinstance(error.__cause__, (FileNotFoundError, ConnectionRefusedError, PermissionError))
+            absent = isinstance(error.__cause__, (FileNotFoundError, PermissionError))
             if command != "stop" or absent or time.monotonic_ns() >= deadline_ns:
                 return error
             time.sleep(_POLL_S)

@@ -184,7 +184,7 @@ def runner_unit(inputs: ServiceInputs) -> str:
     command = [word(str(inputs.programs / "edge-run")), *(argument(text) for text in paths)]
     # One word with its text, so that a text that begins with a dash is no option.
     command.append(argument(f"--instruction={inputs.instruction}"))
-    command += [argument("--record"), FLIGHT_LOG]
+    command += [argument("--record"), FLIGHT_LOG, *([argument("--require-operator")] if inputs.operator_arm else [])]
     if inputs.trust is not None:
         # The newest release that was run is remembered where the service may write.
         command += [argument(text) for text in ("--trust", str(inputs.trust), "--state", str(STATE_DIRECTORY))]

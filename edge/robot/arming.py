@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Final, Protocol
 
 from firmware_bridge.client import BridgeStatus, BridgeUnavailable
+from firmware_bridge.core.config import RobotConfig
 
 POLL_S: Final = 0.05
 CONFIRM_POLL_S: Final = 0.01
@@ -83,6 +84,20 @@ class _Gate:
         return not self.why
 
 
+def check_bridge(status: BridgeStatus | None, robot: RobotConfig) -> None:
+    """Raise RefusedError when the bridge serves another robot, or lets a runner arm without the operator required.
+
+    It read the robot file when it started: the file may have changed, or another file's bridge has the same socket.
+    """
+    if status is None:
+        return
+    restart = f"restart edge-bridge with this robot file, or give both a --socket of their own ({robot.bridge.socket})"
+    if status.robot != robot.digest:
+        raise RefusedError(f"the bridge serves another robot than {robot.name}, {robot.address}: {restart}")
+    if robot.safety.operator_arm and status.permit == "not needed":
+        raise RefusedError(f"safety.operator_arm: this robot file requires an operator, the bridge does not: {restart}")
+
+
 def arm(
     bridge: Bridge,
     *,
@@ -103,6 +118,8 @@ def arm(
     StoppedEarlyError or BridgeUnavailable.
     """
     gate = _Gate(obstacle, operator, clock, say)
+    if stop_requested():
+        raise StoppedEarlyError("stopped before the robot was armed")
     while not gate.is_clear(bridge.poll()):
         if stop_requested():
             raise StoppedEarlyError("stopped before the robot was armed")

@@ -136,6 +136,11 @@ def parser() -> argparse.ArgumentParser:
     )
     add_live_arguments(p)
     p.add_argument("--record", type=Path, metavar="FILE.mcap", help="write a flight log")
+    p.add_argument(
+        "--require-operator",
+        action="store_true",
+        help="refuse a robot file without operator_arm (the installed service, which starts again after a crash)",
+    )
     p.add_argument("--socket", type=Path, metavar="PATH", help="socket of edge-bridge (default: the robot file's)")
     p.add_argument("--domain", type=int, metavar="N", help="DDS domain (default: the robot file's)")
     p.add_argument("--json", metavar="FILE|-", help="write the result as JSON")
@@ -155,6 +160,11 @@ def read_options(args: argparse.Namespace) -> tuple[RobotConfig, RunOptions]:
             raise ConfigError(f"--record {args.record}: there is no directory {args.record.parent}")
         check_result_target(str(args.record), "--record")
     robot = load_robot_config(args.robot, socket=args.socket, domain=args.domain)
+    if args.require_operator and not robot.safety.operator_arm:
+        raise ConfigError(
+            f"robot file {args.robot}: safety.operator_arm: expected true, found false: this service starts again by "
+            "itself; set it to true, or install it anew with edge-install units --arm-at-start"
+        )
     if robot.ros2_publish.publish and importlib.util.find_spec("cyclonedds") is None:
         raise ModuleNotFoundError("No module named 'cyclonedds'", name="cyclonedds")
     options = RunOptions(

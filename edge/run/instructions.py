@@ -18,6 +18,7 @@ from edge.live.feed import LiveFeed
 from edge.reasoning.prompt import InstructionError, check_instruction
 from edge.robot.arming import RefusedError
 from edge.run.stop_phrase import is_stop_phrase
+from edge.safety.faults.table import FAULTS
 from firmware_bridge.core.config import RobotConfig
 from firmware_bridge.dds.shared_bus import SharedBus
 
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 MAX_BYTES: Final = 4096
 """Largest datagram, bytes: 400 characters of an instruction, each in its longest JSON escape."""
 MAX_A_POLL: Final = 4
+STOP_PHRASE: Final = f"{FAULTS['stop-phrase'].message} {FAULTS['stop-phrase'].advice}"
+"""Fault that ends a run when an instruction channel brings a stop phrase."""
 
 
 class InstructionSocket:

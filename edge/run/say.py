@@ -87,14 +87,16 @@ def stop_robot(path: Path, bridge: Path | None = None) -> int:
         code = operate(STOP, *bridges)[0] if bridges else EXIT_REFUSED
         answer = None if asking is None else _stop_answer(asking, path)
     runners = None if answer is None else Path(str(answer.get("bridge")))
-    if runners is not None and (code != EXIT_DONE or runners not in bridges):
-        # The runner names its bridge: that bridge's state decides, and that of any bridge which the user named.
+    confirmed = answer is not None and answer.get("confirmed") is True
+    if runners is not None and (code != EXIT_DONE or runners not in bridges or not confirmed):
+        # The runner names its bridge: that bridge's state decides, and that of any bridge which the user named. It may
+        # have died in a list of several.
         runners_code = operate(STOP, runners)[0]
         code = runners_code if bridge is None else max(code, runners_code)
     if code == EXIT_DONE and (bridge is not None or runners is not None):
         sys.stdout.write("stopped: the bridge confirms it; before the robot moves again: `edge-bridge arm`, new run\n")
         return EXIT_DONE
-    if code == EXIT_REFUSED and bridge is None and answer is not None and answer.get("confirmed") is True:
+    if code == EXIT_REFUSED and bridge is None and confirmed:
         sys.stdout.write(
             "stopped: the runner has ended its run and its bridge confirms it; no operator's stop was possible, so a "
             "new run can arm: to prevent that, sudo edge-bridge stop\n"

@@ -8,6 +8,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import psutil
@@ -24,15 +25,14 @@ from edge.inference.start_guard import WARM_UP_S
 from edge.inference.warm_up import check_tick, open_proven, warm_up
 from edge.reasoning.generation_cycle import Mode
 from edge.reasoning.prompt import InstructionError
-from edge.robot.arming import POLL_S, RefusedError, StoppedEarlyError, arm, disarm
+from edge.robot.arming import POLL_S, RefusedError, StoppedEarlyError, arm, check_bridge, disarm
 from edge.robot.inputs import CommandTap, RobotInputs
 from edge.run.assembly import Engines, Loops, RunOptions, StopEvents, assemble
-from edge.run.instructions import InstructionChannels, open_channels
+from edge.run.instructions import STOP_PHRASE, InstructionChannels, open_channels
 from edge.run.result import close_log, run_record, run_result
 from edge.run.service import ServiceReporter
-from edge.run.views import Views
+from edge.run.views import LIVE_STOP, Views
 from edge.safety.faults.findings import Finding
-from edge.safety.faults.table import FAULTS
 from edge.safety.late_command import hold_while_late
 from edge.safety.watchdog import Hang, ReasoningWatch
 from firmware_bridge.client import BridgeClient, BridgeStatus, BridgeUnavailable
@@ -53,9 +53,6 @@ STOP_CONFIRM_S = 1.0
 """Part of it for the bridge's confirmation that it has sent zero velocity, s."""
 STANDSTILL_S = 2.0
 """Time for the robot to come to rest and report it, s."""
-STOP_PHRASE = f"{FAULTS['stop-phrase'].message} {FAULTS['stop-phrase'].advice}"
-"""Fault that ends a run when the instruction channel brings a stop phrase."""
-LIVE_STOP = "The live view's STOP button has ended the run. Start a new run when the way is free."
 LINES = 200
 """Lines for the operator that wait to be printed; more are dropped, oldest first."""
 
@@ -123,6 +120,7 @@ class RunSession:
         """Forward a new instruction to reasoning; after a stop phrase the robot has been stopped on return."""
         if channel is not None and (instruction := channel.poll()) is not None:
             loops.reasoning.submit(instruction)
+            self._options = replace(self._options, instruction=instruction)
             self._print(f"new instruction: {instruction}")
 
     def request_stop(self) -> None:
@@ -147,6 +145,7 @@ class RunSession:
         result: dict[str, Any] | None = None
         end: Deadline | None = None
         try:
+            check_bridge(bridge.poll(), self._robot)
             sink = CommandTap(bridge)
             # The threads of a protocol's library inherit the priority, so that poses and pictures do not wait either.
             inputs = run_as(

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Final
 
 from edge.flightlog.recorder import Recorder
 from edge.live.feed import LiveFeed, Ros2Feed
 from edge.live.options import LiveError, LiveOptions
 from edge.robot.arming import RefusedError
 from firmware_bridge.core.config import RobotConfig
+
+LIVE_STOP: Final = "The live view's STOP button has ended the run. Start a new run when the way is free."
 
 
 class Views:

@@ -6,6 +6,7 @@ only the `[dds]` addresses and `operator_arm` differ. The tables are declared in
 
 from __future__ import annotations
 
+import hashlib
 import math
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
@@ -145,6 +146,12 @@ class RobotConfig:
         if self.can is not None:
             return f"CAN {self.can.interface}:{self.can.channel}"
         return f"DDS domain {self.network.domain} on {self.network.interface}"
+
+    @property
+    def digest(self) -> int:
+        """64 bits of the robot's name, protocol and address: runner and bridge must mean the same robot."""
+        text = "\0".join((self.name, self.protocol, self.address))
+        return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little")
 
 
 def load_robot_config(path: Path | str, *, socket: Path | None = None, domain: int | None = None) -> RobotConfig:

@@ -67,7 +67,7 @@ class DangerWatch:
         """Return what forbids motion in every state, apart from a latched emergency stop."""
         robot = self.fresh(now_ns, self._state_timeout_ns)
         if self._estop:
-            return "estop", "emergency stop pressed at the local input"
+            return "estop", "emergency stop pressed at the local input, or its file cannot be read"
         if now_ns - self._remote_estop_ns < REMOTE_NS:
             return "estop", "emergency stop pressed on the remote"
         if now_ns - self._remote_ns < REMOTE_NS:

@@ -5,11 +5,11 @@ Little-endian. Header: magic `TVEB`, version u8, kind u8, payload length u16.
   2 stop      empty
   3 velocity  seq u64, stamp_ns i64 (time.monotonic_ns of the command), vx, vy m/s, wz rad/s as f64
   4 status    stamp_ns i64, state u8, zero_after_stop u8, cause u8, blocked_by u8, permit u8, motion u8, last_seq u64,
-              commands u64, rejected u64, last command 3 x f64, speed f64, then the reason as UTF-8
+              commands u64, rejected u64, robot u64, last command 3 x f64, speed f64, then the reason as UTF-8
   5 release   empty; operator's socket only
   6 state     the robot's newest report (`RobotState`); observers' socket only
   7 battery   its battery; observers' socket only
-Version 1 had neither cause nor blocked_by, version 2 had neither permit, motion, speed nor release.
+Version 1 had neither cause nor blocked_by, version 2 had neither permit, motion, speed nor release, version 3 no robot.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import Final
 from firmware_bridge.core.robot_state import BatteryState, RobotState
 
 MAGIC: Final = b"TVEB"
-VERSION: Final = 3
+VERSION: Final = 4
 STATES: Final = ("disarmed", "arming", "armed", "stopped")
 CAUSES: Final = (
     *("none", "client_stop", "client_lost", "deadman", "shutdown", "suspended"),
@@ -52,7 +52,7 @@ MAX_DATAGRAM_BYTES: Final = 512
 _ARM, _STOP, _VELOCITY, _STATUS, _RELEASE, _STATE, _BATTERY = 1, 2, 3, 4, 5, 6, 7
 _HEADER: Final = struct.Struct("<4sBBH")
 _VELOCITY_BODY: Final = struct.Struct("<Qq3d")
-_STATUS_BODY: Final = struct.Struct("<qBBBBBBQQQ4d")
+_STATUS_BODY: Final = struct.Struct("<qBBBBBBQQQQ4d")
 _STATE_BODY: Final = struct.Struct("<q6dqqq4d4i")
 _BATTERY_BODY: Final = struct.Struct("<qq2d")
 
@@ -94,7 +94,7 @@ class BridgeStatus:
     `zero_after_stop`: stopped, and since then only zero velocity was written. It is True too when the bridge has never
     commanded the robot. `cause` (of CAUSES): the last stop or refusal to arm, `reason` the same as a sentence.
     `blocked_by` (of CAUSES): the reason against arming now. `permit` is one of PERMITS, `motion` one of MOTIONS,
-    `speed_mps` the robot's own speed, -1 without a fresh report.
+    `speed_mps` the robot's own speed, -1 without a fresh report. `robot`: `RobotConfig.digest` of its robot file.
     """
 
     stamp_ns: int
@@ -110,6 +110,7 @@ class BridgeStatus:
     permit: str = "not needed"
     motion: str = "unknown"
     speed_mps: float = -1.0
+    robot: int = 0
 
 
 Message = Arm | Stop | Release | Velocity | BridgeStatus | RobotState | BatteryState
@@ -132,7 +133,7 @@ def encode(message: Message) -> bytes:
         battery = (message.received_ns, message.soc_percent, message.voltage_v, message.current_a)
         return _frame(_BATTERY, _BATTERY_BODY.pack(*battery))
     reason = message.reason.encode("utf-8")[:MAX_REASON_BYTES].decode("utf-8", "ignore").encode("utf-8")
-    counters = (message.last_seq, message.commands, message.rejected)
+    counters = (message.last_seq, message.commands, message.rejected, message.robot)
     flags = (STATES.index(message.state), message.zero_after_stop)
     causes = (CAUSES.index(message.cause), CAUSES.index(message.blocked_by))
     robot = (PERMITS.index(message.permit), MOTIONS.index(message.motion))
@@ -193,9 +194,9 @@ def _decode_status(body: bytes) -> BridgeStatus:
         reason = body[_STATUS_BODY.size :].decode("utf-8")
     except UnicodeDecodeError as error:
         raise LinkError("reason is not UTF-8") from error
-    last_seq, commands, rejected = counters
+    last_seq, commands, rejected, robot = counters
     head = (stamp_ns, STATES[state], reason, last_seq, commands, rejected, (vx, vy, wz), zero == 1)
-    return BridgeStatus(*head, CAUSES[cause], CAUSES[blocked], PERMITS[permit], MOTIONS[motion], speed)
+    return BridgeStatus(*head, CAUSES[cause], CAUSES[blocked], PERMITS[permit], MOTIONS[motion], speed, robot)
 
 
 def _frame(kind: int, body: bytes) -> bytes:

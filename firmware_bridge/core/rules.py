@@ -39,7 +39,7 @@ _ASLEEP_NS: Final = 100 * _NS_PER_MS
 _BURST_NS: Final = 1_000 * _NS_PER_MS  # longer than an operator's command repeats its stop
 _PRESSES: Final = (
     "emergency stop by an operator",
-    "emergency stop pressed at the local input",
+    "emergency stop pressed at the local input, or its file cannot be read",
     "emergency stop pressed on the remote",
     "a person has changed the robot's mode",
 )
@@ -60,9 +60,11 @@ class BridgeCore:
         now_ns: int,
         *,
         latch: str = "",
+        robot: int = 0,
     ) -> None:
-        """`latch`: reason of an earlier bridge process's emergency stop, or empty."""
+        """`latch`: reason of an earlier bridge process's emergency stop, or empty; `robot`: `RobotConfig.digest`."""
         self.clipped = 0
+        self._robot = robot
         self._table = table
         self._period_ns = _NS_PER_S // bridge.rate_hz
         self._deadman_ns = bridge.deadman_ms * _NS_PER_MS
@@ -131,7 +133,7 @@ class BridgeCore:
         disobeys = self._state == "stopped" and not self._released and now_ns - self._stopped_ns >= _STOPPING_NS
         reason = f"{self._reason}; {_STILL_MOVING}" if disobeys and motion == "moving" else self._reason
         permit = self._permit.state(now_ns)
-        return BridgeStatus(now_ns, self._state, reason, *counters, *causes, permit, motion, speed_mps)
+        return BridgeStatus(now_ns, self._state, reason, *counters, *causes, permit, motion, speed_mps, self._robot)
 
     def _note_connection(self, inputs: Inputs, now_ns: int) -> None:
         if inputs.client and not self._had_client:

@@ -6,7 +6,8 @@ import errno
 import socket
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -87,6 +88,24 @@ class TestOperate:
         with answering(path):
             assert [operate(command, tmp_path / "none", path)[0] for command in ("status", "arm", "stop")] == [0] * 3
 
+    def test_a_bridge_that_has_died_beside_another_one_is_no_success(self, tmp_path: Path, capsys) -> None:
+        dead, mine = tmp_path / "dead", tmp_path / "own"
+        left_behind(dead)
+        with answering(mine) as (bridge,):
+            assert operate("stop", dead, mine)[0] == 1
+        assert Stop() in bridge.received
+        told = capsys.readouterr().err
+        assert str(dead) in told and "its robot is NOT stopped" in told
+
+    def test_a_bridge_that_starts_again_within_a_second_takes_the_stop(self, tmp_path: Path) -> None:
+        path = tmp_path / "service"
+        left_behind(path)
+        with ExitStack() as stack, ThreadPoolExecutor(1) as pool:
+            code = pool.submit(operate, "stop", path)
+            (bridge,) = stack.enter_context(answering(path))
+            assert code.result()[0] == 0
+        assert Stop() in bridge.received
+
     def test_an_arm_that_two_bridges_could_mean_is_refused(self, tmp_path: Path, capsys) -> None:
         paths = tmp_path / "service", tmp_path / "own"
         with answering(*paths) as bridges:
@@ -103,6 +122,12 @@ class TestOperate:
         with answering(*([mine] if own else [])):
             assert operate("stop", service, mine)[0] == code
         assert f"no permission for the bridge at {service}{OPERATOR_SUFFIX}; use sudo" in capsys.readouterr().err
+
+
+def left_behind(path: Path) -> None:
+    """The operators' socket of a bridge that was killed."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as killed:
+        killed.bind(f"{path}{OPERATOR_SUFFIX}")
 
 
 def deny(monkeypatch: pytest.MonkeyPatch, path: Path) -> None:

@@ -223,23 +223,3 @@ def test_artifacts_that_do_not_verify_are_refused_by_name(tmp_path: Path, artifa
     assert done.returncode == 3
     assert len(done.stderr.splitlines()) == 1
     assert "action_expert.onnx" in done.stderr
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (("--instruction", " "), "instruction is empty"),
-        (("--duration", "-3"), "--duration"),
-        (("--release-delay", "soon"), "release delay"),
-        (("--robot", "no-such-robot.toml"), "no-such-robot.toml"),
-        (("--json", "."), "--json"),
-        (("--record", GO2_SIM), "never overwritten"),
-        (("--record", "no-such-folder/flight.mcap"), "no-such-folder"),
-    ],
-)
-def test_bad_input_gets_one_line_and_exit_code_2(tmp_path: Path, change: tuple[str, str], message: str) -> None:
-    done = run(*Robot(tmp_path, 1, tmp_path).arguments(*change))
-    assert done.returncode == 2
-    assert len(done.stderr.splitlines()) == 1
-    assert message in done.stderr

@@ -99,6 +99,7 @@ def test_it_writes_both_units_and_the_user_and_prints_the_start_command(units: U
     assert FIREWALL_UNIT in result["commands"][starts[0]]
     text = (tmp_path / "units" / RUNNER_UNIT).read_text()
     assert "drives after `edge-bridge arm` only" in text and "--arm-at-start" not in text
+    assert '"--require-operator"' in text  # a robot file that is changed later must not make it drive by itself
 
 
 @pytest.mark.slow
@@ -109,6 +110,7 @@ def test_services_of_a_board_follow_its_current_release(units: Units, artifacts_
     shutil.copytree(tmp_path / "bin", release / "venv/bin")
     shutil.copytree(artifacts_dir, release / "artifacts")
     (home / "current").symlink_to("releases/3")
+    assert units(artifacts=home / "current/artifacts")[0] == EXIT_BAD_INPUT  # they would stay on this release
     assert units("--home", str(home), artifacts=home / "current/artifacts")[0] == EXIT_DONE
     for unit in (BRIDGE_UNIT, RUNNER_UNIT):
         text = (tmp_path / "units" / unit).read_text()
@@ -140,7 +142,8 @@ def test_with_consent_it_is_written_and_not_enabled_at_boot(units: Units, alone:
     assert (code, result and result["commands"][-1]) == (EXIT_DONE, f"sudo systemctl start {RUNNER_UNIT}")
     assert result is not None
     assert not any("enable" in command and RUNNER_UNIT in command for command in result["commands"])
-    assert "# --arm-at-start was given: " in (tmp_path / "units" / RUNNER_UNIT).read_text()
+    text = (tmp_path / "units" / RUNNER_UNIT).read_text()
+    assert "# --arm-at-start was given: " in text and "--require-operator" not in text
 
 
 def test_useless_consent_is_reported(units: Units, capsys: pytest.CaptureFixture[str]) -> None:

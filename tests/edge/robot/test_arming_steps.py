@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
-from edge.robot.arming import RefusedError, arm, disarm
+from edge.robot.arming import RefusedError, arm, check_bridge, disarm
 from firmware_bridge.client import BridgeStatus, BridgeUnavailable
+from firmware_bridge.core.config import DdsConfig, load_robot_config
+from tests.support.processes import GO2_SIM
 
 MS = 1_000_000
 START_NS = 10**12
@@ -213,3 +217,32 @@ class TestDisarm:
 
         bridge = FakeBridge(gone)
         assert not bridge.disarm() and bridge.stopped_ms == [0.0]
+
+
+# The bridge that was reached
+
+
+def test_a_bridge_with_the_same_robot_file_is_accepted() -> None:
+    robot = load_robot_config(GO2_SIM)
+    check_bridge(replace(status(0), robot=robot.digest), robot)
+    check_bridge(None, robot)
+
+
+@pytest.mark.parametrize(
+    "change", [{"name": "other"}, {"dds": DdsConfig(7, "lo", ("127.0.0.1",))}], ids=["name", "address"]
+)
+def test_a_bridge_of_another_robot_is_refused(change: dict[str, Any]) -> None:
+    robot = load_robot_config(GO2_SIM)
+    with pytest.raises(RefusedError, match="serves another robot than"):
+        check_bridge(replace(status(0), robot=replace(robot, **change).digest), robot)
+
+
+@pytest.mark.parametrize(("permit", "refused"), [("not needed", True), ("needed", False), ("given", False)])
+def test_a_bridge_that_arms_without_the_operator_whom_the_robot_file_requires_is_refused(
+    permit: str, refused: bool
+) -> None:
+    robot = load_robot_config(GO2_SIM)
+    robot = replace(robot, safety=replace(robot.safety, operator_arm=True))
+    found = replace(status(0), robot=robot.digest, permit=permit)
+    with pytest.raises(RefusedError, match="operator_arm") if refused else nullcontext():
+        check_bridge(found, robot)

@@ -250,6 +250,12 @@ class TestRunner:
             runner.run()
         assert runner.now_ms < 5_200
 
+    def test_a_stop_before_the_first_request_sends_none(self) -> None:
+        runner = Runner(Bench(), stop=True)
+        with pytest.raises(StoppedEarlyError, match="before the robot was armed"):
+            runner.run()
+        assert runner.asked_ms == [] and runner.bench.status.state == "disarmed"
+
     def test_without_operator_arm_nothing_is_waited_for(self) -> None:
         runner = Runner(Bench())
         runner.run()

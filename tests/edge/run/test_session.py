@@ -72,6 +72,7 @@ class Rig:
             "check_tick": lambda *_: None,
             "ServiceReporter": lambda *_args, **_named: self,
             "BridgeClient": lambda _path: self,
+            "check_bridge": lambda *_: None,
             "RobotInputs": self._inputs,
             "assemble": self._assemble,
             "arm": lambda *_args, **_named: self.on_arm(),
@@ -85,11 +86,13 @@ class Rig:
         for name, fake in fakes.items():
             monkeypatch.setattr(module, name, fake)
 
-    def run(self, robot: Any = ROBOT, record: Path | None = None) -> dict[str, Any]:
+    def run(
+        self, robot: Any = ROBOT, record: Path | None = None, say: Callable[[str], None] = lambda _line: None
+    ) -> dict[str, Any]:
         runtime = SimpleNamespace(tick_period_ms=100, image_px=32, frame_offsets_s=(1.0, 0.0), switches=Switches())
         artifacts: Any = SimpleNamespace(runtime=runtime, guided_by_waypoints=False, directory=Path("a"))
         options = RunOptions("go", Mode.ASYNC, None, ReleaseDelay(0.0, 0.0, 0), record)
-        self.session = RunSession(artifacts, robot, options, lambda _line: None)
+        self.session = RunSession(artifacts, robot, options, say)
         return self.session.run()
 
     # The bridge
@@ -287,6 +290,33 @@ def test_without_an_operator_it_is_a_refusal_after_ten_seconds(rig: Rig) -> None
         RefusedError, match=r"no state from the robot in 10 s on .* \(CAN interface can0 is down\): is it on"
     ):
         rig.run()
+
+
+def test_the_bridge_of_another_robot_is_left_before_anything_is_opened(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise RefusedError("the bridge serves another robot")
+
+    monkeypatch.setattr(module, "check_bridge", refuse)
+    monkeypatch.setattr(module, "RobotInputs", None)
+    with pytest.raises(RefusedError, match="another robot"):
+        rig.run()
+    assert rig.events == ["bridge closed"]
+
+
+def test_while_it_waits_to_be_armed_it_takes_the_newest_instruction(rig: Rig) -> None:
+    said: list[str] = []
+
+    def arm_later() -> int:
+        channel: Any = SimpleNamespace(poll=lambda: "go to the lift", stopped=False)
+        loops: Any = SimpleNamespace(reasoning=SimpleNamespace(submit=said.append))
+        rig.session._take_instructions(channel, loops)
+        return 1
+
+    rig.on_arm = arm_later
+    rig.run(say=said.append)
+    assert said[0] == "go to the lift" and "armed and driving go2: go to the lift" in said
 
 
 def test_a_stop_ends_the_waiting_for_the_robot(rig: Rig) -> None:
