@@ -23,6 +23,9 @@ DEPTH: Final = 256
 REFUSALS_HZ: Final = 1.0
 """Most lines about refused instructions: a node that floods the topic must not flood the terminal."""
 
+REPEATED_NS: Final = 5_000_000_000
+"""The same text within this time of the last one is a repetition."""
+
 
 class Ros2Instructions:
     """Takes instructions from one topic; reliable, so that a stop phrase is not lost. Raises DdsError."""
@@ -40,10 +43,15 @@ class Ros2Instructions:
         """Whether a stop phrase has been received."""
         self._topic, self._check, self._stop, self._say = topic, check, stop, say
         self._refusals = Throttle(REFUSALS_HZ)
+        self._newest, self._newest_ns = "", 0
         self._reader = bus.open().reader(topic, String_, depth=DEPTH, reliable=True)
 
     def poll(self) -> str | None:
-        """Return the newest valid instruction since the last poll; None without one or after a stop phrase."""
+        """Return the newest valid instruction since the last poll; None without one or after a stop phrase.
+
+        A text that a node goes on sending, as `ros2 topic pub` does once a second, counts once: given again it would
+        end the generation under way, and send a robot that has arrived off again.
+        """
         texts = self._take()
         if any(map(is_stop_phrase, texts)):
             self.stopped = True
@@ -53,8 +61,9 @@ class Ros2Instructions:
             self._refuse("a stop phrase has ended this run")
         elif texts:
             try:
-                self._check(texts[-1])  # this one only: it counts the prompt's tokens
-                return texts[-1]
+                if not self._repeats(texts[-1]):
+                    self._check(texts[-1])  # this one only: it counts the prompt's tokens
+                    return texts[-1]
             except InstructionError as error:
                 self._refuse(str(error))
         return None
@@ -74,6 +83,11 @@ class Ros2Instructions:
         except DDS_ERRORS as error:
             self._refuse(f"DDS: {error.msg}")
         return texts
+
+    def _repeats(self, text: str) -> bool:
+        before, before_ns = self._newest, self._newest_ns
+        self._newest, self._newest_ns = text, time.monotonic_ns()
+        return text == before and self._newest_ns - before_ns < REPEATED_NS
 
     def _refuse(self, why: str) -> None:
         if self._refusals.due(time.monotonic_ns()):

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge.reasoning.prompt import InstructionError
+from edge.run import ros2_instructions as module
 from edge.run.instructions import InstructionChannels
 from edge.run.ros2_instructions import Ros2Instructions
 from firmware_bridge.core.config import DdsConfig
@@ -77,6 +78,21 @@ def test_an_instruction_arrives_in_one_line_and_once(rig: Rig) -> None:
     rig.send("walk  to the\nvending machine")
     assert rig.taken() == "walk to the vending machine"
     assert rig.channel.poll() is None and rig.lines == []
+
+
+def test_a_text_that_a_node_repeats_is_taken_once_until_it_has_paused(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at_s = iter((0.0, 1.0, 2.0, 7.5))
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic_ns=lambda: round((next(at_s) + 10) * 1e9)))
+    monkeypatch.setattr(rig.channel, "_take", lambda: ["walk to the door"])
+    assert [rig.channel.poll() for _ in range(4)] == ["walk to the door", None, None, "walk to the door"]
+
+
+def test_a_text_that_another_one_has_replaced_is_taken_again(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    texts = iter(("walk to the door", "turn left", "walk to the door"))
+    monkeypatch.setattr(rig.channel, "_take", lambda: [next(texts)])
+    assert [rig.channel.poll() for _ in range(3)] == ["walk to the door", "turn left", "walk to the door"]
 
 
 def test_the_newest_of_several_is_taken(rig: Rig) -> None:
