@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from edge.core.geometry import wrap_angle
+from edge.core.stamp_lag import StampLag
 from edge.safety.faults.findings import Finding
 
 MAX_AGE_LIMIT_NS = 150_000_000
@@ -35,13 +36,6 @@ within the third, the robot is blocked, and its odometry works. A slow robot tak
 MISMATCH_MPS = 0.5
 MISMATCH_RADPS = 0.5
 MISMATCH_WINDOW_NS = 200_000_000
-CLOCK_DRIFT = 100e-6
-"""Largest rate difference between the robot's clock and ours; more counts as a delay."""
-CLOCK_BACK_NS = 100_000_000
-CLOCK_STEP_NS = 5_000_000_000
-"""The robot's clock was set when its stamps go back by more than the first, or the offset between its clock and ours
-grows by more than the second from one report to the next. An offset that grows more slowly is a delay."""
-
 # The robot stands when all reported signals stay below these for STILL_NS.
 STILL_NS = 300_000_000
 STILL_MPS = 0.05
@@ -96,20 +90,6 @@ class Verdict:
     findings: tuple[Finding, ...]
 
 
-@dataclass(frozen=True)
-class _RobotClock:
-    """Difference between the robot's clock and ours, by the reports so far, ns."""
-
-    at_ns: int
-    """Arrival of the quickest report."""
-    least_ns: int
-    """Its offset: arrival minus stamp."""
-    stamp_ns: int
-    """Newest stamp."""
-    offset_ns: int
-    """Offset of the last report."""
-
-
 def age_findings(age_ns: int) -> tuple[Finding, ...]:
     """Return row 11's finding for a pose of this age."""
     if age_ns > MAX_AGE_ZERO_NS:
@@ -132,7 +112,7 @@ class OdometryGate:
         self._held_ns: int | None = None
         self._held_at = (0.0, 0.0, 0.0)
         self._freed = False
-        self._clock: _RobotClock | None = None
+        self._lag = StampLag()
         self.rejected = 0
 
     def step(self, report: OdometryInputs) -> Verdict:
@@ -140,7 +120,7 @@ class OdometryGate:
         if not _finite(report):
             self.rejected += 1
             return Verdict(None, (Finding("odometry-not-finite", f"pose {report.T_odom_base}"),))
-        findings = age_findings(self._lag_ns(report))
+        findings = age_findings(self._lag.of(report.received_ns, report.robot_stamp_ns))
         last = self._last
         if last is None:
             self._last = report
@@ -266,23 +246,6 @@ class OdometryGate:
                 name = "robot-blocked" if self._freed else "odometry-stays-frozen"
         self._held_ns, self._held_at, self._freed = report.received_ns, report.T_odom_base, False
         return (Finding(name, f"no motion for {held_ns / 1e9:.1f} s at {math.hypot(*command[:2]):.2f} m/s"),)
-
-    def _lag_ns(self, report: OdometryInputs) -> int:
-        """Return this report's delay against the quickest report so far, by the robot's own clock."""
-        received_ns, stamp_ns = report.received_ns, report.robot_stamp_ns
-        if stamp_ns <= 0:
-            return 0
-        offset_ns, clock = received_ns - stamp_ns, self._clock
-        if clock is not None:
-            lag_ns = offset_ns - clock.least_ns - round(CLOCK_DRIFT * (received_ns - clock.at_ns))
-            went_back = stamp_ns <= clock.stamp_ns - CLOCK_BACK_NS
-            # Not the lag itself: on a congested link it grows without end, although no clock was set.
-            was_set = went_back or offset_ns - clock.offset_ns > CLOCK_STEP_NS
-            if lag_ns > 0 and not was_set:
-                self._clock = replace(clock, stamp_ns=max(stamp_ns, clock.stamp_ns), offset_ns=offset_ns)
-                return lag_ns
-        self._clock = _RobotClock(received_ns, offset_ns, stamp_ns, offset_ns)
-        return 0
 
 
 def elapsed_s(before: OdometryInputs, after: OdometryInputs) -> float:

@@ -9,6 +9,7 @@ import time
 from typing import Final
 from urllib.parse import urlsplit
 
+from edge.core.stamp_lag import StampLag
 from edge.robot.cameras.multipart import MjpegParser, StreamError
 from edge.robot.cameras.newest import Backoff, NewestPicture, ReceivingThread
 from firmware_bridge.core.robot_state import CameraError
@@ -65,7 +66,7 @@ class MjpegCamera:
     def _receive(
         self, connection: socket.socket, closing: threading.Event, backoff: Backoff, *, same_clock: bool
     ) -> None:
-        parser, picture_ns = MjpegParser(), time.monotonic_ns()
+        parser, picture_ns, lag = MjpegParser(), time.monotonic_ns(), StampLag()
         while not closing.is_set():
             if time.monotonic_ns() - picture_ns > self._stall_ns:
                 raise CameraError(f"no complete picture for {self._stall_ns / 1e9:g} s, connecting again")
@@ -79,9 +80,11 @@ class MjpegCamera:
             if not parts:
                 continue
             picture_ns = time.monotonic_ns()
-            stamp_ns = parts[-1].capture_ns if same_clock else None
+            stamp_ns = parts[-1].capture_ns
             # A stamp from the future is not of this clock.
-            known = stamp_ns is not None and stamp_ns <= picture_ns
-            captured_ns = stamp_ns if known and stamp_ns is not None else picture_ns - self._latency_ns
+            if stamp_ns is not None and same_clock and stamp_ns <= picture_ns:
+                captured_ns = stamp_ns
+            else:
+                captured_ns = picture_ns - self._latency_ns - lag.of(picture_ns, stamp_ns or 0)
             self._newest.put(parts[-1].jpeg, captured_ns)
             backoff.reset()

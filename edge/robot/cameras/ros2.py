@@ -6,6 +6,7 @@ import threading
 import time
 from typing import Final
 
+from edge.core.stamp_lag import StampLag
 from edge.robot.cameras.newest import Backoff, NewestPicture, ReceivingThread
 from edge.robot.cameras.ros2_pictures import compressed_picture, raw_picture
 from firmware_bridge.core.config_ros2 import check_topic_name, dds_topic
@@ -34,11 +35,13 @@ class Ros2Camera:
         """`network`: a process that reads more than one topic shares a SharedBus and closes it itself.
 
         `raw`: the topic carries sensor_msgs/Image. `reliable`: ask for lost pictures again, which matches reliable
-        publishers only. `latency_ns`: age of a picture when it arrives.
+        publishers only. `latency_ns`: age of the quickest picture when it arrives; those that take longer are older by
+        their headers' stamps.
         """
         check_topic_name("camera.source", topic)
         self._topic, self._raw, self._reliable = dds_topic(topic), raw, reliable
         self._latency_ns = latency_ns
+        self._lag = StampLag()
         self._owns_bus = isinstance(network, DdsConfig)
         self._bus = SharedBus(network) if isinstance(network, DdsConfig) else network
         self._newest: NewestPicture[bytes] = NewestPicture(f"{'ros2raw' if raw else 'ros2'}:{topic}")
@@ -54,7 +57,7 @@ class Ros2Camera:
             jpeg, self.header_stamp_ns = raw_picture(data) if self._raw else compressed_picture(data)
         except CameraError as error:
             raise CameraError(f"camera {self._newest.name}: {error}") from error
-        self.captured_ns = captured_ns
+        self.captured_ns = captured_ns - self._lag.of(captured_ns, self.header_stamp_ns or 0)
         return jpeg
 
     def close(self) -> None:
