@@ -1,8 +1,8 @@
 """Recoveries: commands that replace the plan's when it makes no progress (ours).
 
 * Back off: the robot is commanded forward and does not move, or was just stopped because its pose stayed. It drives
-  back along its own trail, the only space behind it that is proved free. The plan cannot do so: it does not sense
-  contact, and its arc never reverses.
+  back along its own trail of the last 30 s, the only space behind it that is proved free. The plan cannot do so: it
+  does not sense contact, and its arc never reverses.
 * Turn at a standstill: the plan has stood for long although the text's waypoints lead on. The robot turns on the spot
   towards them, so that the next picture differs.
 * Stand at the goal: once past the goal the robot no longer sees it, and the text becomes unreliable. Texts that see the
@@ -41,6 +41,7 @@ MAX_STEP_S: Final = 0.2
 """Largest duration counted for one late tick, s."""
 _TRAIL_M, _TRAIL_RAD = 0.05, 0.1  # spacing of the trail's poses
 _TRAIL_POSES: Final = 60
+_TRAIL_NS: Final = 30_000_000_000  # an older pose does not prove that its place is still free
 _STILL_M, _STILL_RAD = 0.03, 0.1  # less motion than this counts as none
 _LOOK_BACK_M: Final = 0.15  # distance of the trail's pose whose heading is taken up
 _FAILED_M: Final = 0.1  # backing off by less than this counts as failed
@@ -111,7 +112,7 @@ class BackOff:
 
     def __init__(self, config: BackOffConfig) -> None:
         self._config = config
-        self._trail: deque[SE2] = deque(maxlen=_TRAIL_POSES)
+        self._trail: deque[tuple[int, SE2]] = deque(maxlen=_TRAIL_POSES)  # (ns, pose)
         self._commanded: _Commanded | None = None
         self._retreat: _Retreat | None = None
         self._stuck_at: SE2 | None = None
@@ -133,8 +134,8 @@ class BackOff:
             self._end(T_odom_base)
             return command
         if self._retreat is None:
-            if not self._trail or _gap(self._trail[-1], T_odom_base, _TRAIL_M, _TRAIL_RAD) >= 1.0:
-                self._trail.append(T_odom_base)
+            if not self._trail or _gap(self._trail[-1][1], T_odom_base, _TRAIL_M, _TRAIL_RAD) >= 1.0:
+                self._trail.append((now_ns, T_odom_base))
             if not self._is_stuck(command, T_odom_base, now_ns, elapsed_s):
                 return command
             self._tries += 1
@@ -184,12 +185,14 @@ class BackOff:
         stands = now_ns - retreat.moved_ns >= config.stands_s * 1e9
         if stands or now_ns - retreat.since_ns >= retreat.times * config.at_most_s * 1e9:
             return None
-        while self._trail and _ahead_m(self._trail[-1], pose) < _STILL_M:
+        while self._trail and _ahead_m(self._trail[-1][1], pose) < _STILL_M:
             self._trail.pop()
+        while self._trail and retreat.since_ns - self._trail[0][0] > _TRAIL_NS:
+            self._trail.popleft()
         if not self._trail or distance_m(retreat.start, pose) >= retreat.times * config.distance_m:
             return None
-        behind = (each for each in reversed(self._trail) if _ahead_m(each, pose) >= _LOOK_BACK_M)
-        turn_rad = wrap_angle(next(behind, self._trail[0]).theta_rad - pose.theta_rad)
+        behind = (each for _, each in reversed(self._trail) if _ahead_m(each, pose) >= _LOOK_BACK_M)
+        turn_rad = wrap_angle(next(behind, self._trail[0][1]).theta_rad - pose.theta_rad)
         most = min(config.turn_radps, config.wz_max_radps) * scale
         wz_radps = min(max(turn_rad / _REACH_S, -most), most)
         vx_mps = -speed_mps if abs(turn_rad) < _TURN_FIRST_RAD else 0.0

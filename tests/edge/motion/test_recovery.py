@@ -211,6 +211,15 @@ def test_such_a_stop_long_ago_is_forgotten() -> None:
     assert run.go(1).reason == "ok"
 
 
+@pytest.mark.parametrize(("stood_s", "backs_off"), [(20, True), (40, False)])
+def test_a_trail_older_than_half_a_minute_is_not_driven_back_on(stood_s: int, backs_off: bool) -> None:
+    run = Run(BackOff(BACK), wall_at(0.4))
+    run.go(10)
+    run.go(stood_s * 10, replace(STANDS, reason="arrived"))
+    run.go(60)
+    assert (BACKING_OFF in run.reasons) is backs_off
+
+
 def test_stopped_so_again_and_again_it_gives_up_after_three_drives_back() -> None:
     run = held(glide)
     run.moves = jammed
