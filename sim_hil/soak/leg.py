@@ -83,7 +83,7 @@ class Leg:
         self._sampler = ProcessSampler()
         self._injector: Injector | None = None
         self._task: TaskRun | None = None
-        self._touched_ns = 0
+        self._touched_ns, self._explained = 0, ""
         self._begin_ns = 0
         self._driven_ns: int | None = None
         self._sampled_ns = 0
@@ -211,8 +211,7 @@ class Leg:
         self._stack.end("bridge")
         cause, raised = _end_of_run(self._stack.result(f"edge-run-{self._stack.runs}"))
         refused = not self._armed and code == EXIT_REFUSED
-        if explained == CONTACT and not contact_explains(raised, refused=refused):
-            explained = ""
+        explained = self._explained = explained_end(explained, self._explained, raised, refused=refused)
         about = {"cause": cause, "explained": explained, "during": during, "bridge_died": bridge_died}
         self._note("life_end", run=self._stack.runs, code=code, **about)
         self.stops += 1
@@ -309,12 +308,16 @@ class Leg:
         _append(self._events, {"t_ns": time.monotonic_ns(), "kind": kind, **fields})
 
 
-def contact_explains(raised: set[str], *, refused: bool) -> bool:
-    """Return whether a contact explains the end of a runner that raised these faults, or whose arming was refused.
+def explained_end(explained: str, before: str, raised: set[str], *, refused: bool) -> str:
+    """Return the explanation of a runner's end, "" without one.
 
-    A robot that fell onto an obstacle leans on it until somebody lifts it, and no later runner may arm it.
+    `explained`: what happened shortly before; `before`: the explanation of the end before; `raised`: the runner's
+    faults; `refused`: whether its arming was refused. A contact explains a fall. A robot that fell lies or leans there
+    until somebody lifts it, and no later runner may arm it.
     """
-    return refused or bool(raised & CONTACT_STOPS)
+    if refused:
+        return explained or (CONTACT if before == CONTACT else "")
+    return explained if explained != CONTACT or raised & CONTACT_STOPS else ""
 
 
 def _end_of_run(result: Path) -> tuple[str, set[str]]:

@@ -13,7 +13,7 @@ from edge.run.say import SayError
 from sim_hil.realtime.stack import StackOptions
 from sim_hil.realtime.truth import TruePose, read_lines
 from sim_hil.soak import leg as soak_leg
-from sim_hil.soak.leg import EVENTS, Leg, LegOptions, contact_explains
+from sim_hil.soak.leg import CONTACT, EVENTS, Leg, LegOptions, explained_end
 from sim_hil.soak.tasks import SoakTask
 
 S = 1_000_000_000
@@ -70,15 +70,19 @@ def test_an_instruction_is_sent_again_to_a_runner_too_busy_to_answer(
 
 
 @pytest.mark.parametrize(
-    ("raised", "refused", "explains"),
+    ("explained", "before", "raised", "refused", "expected"),
     [
-        ({"tipped-over", "frames-late"}, False, True),
-        (set(), True, True),  # the robot still leans on what it fell onto: it must not be armed
-        (set(), False, False),
-        ({"deadman"}, False, False),
+        (CONTACT, "", {"tipped-over", "frames-late"}, False, CONTACT),
+        (CONTACT, "", set(), False, ""),
+        (CONTACT, "", {"deadman"}, False, ""),
+        (CONTACT, "", set(), True, CONTACT),  # it leans on what it fell onto: it must not be armed
+        ("", CONTACT, set(), True, CONTACT),  # it lies where it fell, and the person whom it touched has gone on
+        ("", "", set(), True, ""),
+        ("", CONTACT, {"tipped-over"}, False, ""),
+        ("half of the states lost", "", set(), False, "half of the states lost"),
     ],
 )
-def test_a_contact_explains_a_fall_and_a_refusal_to_arm_but_no_other_end(
-    raised: set[str], refused: bool, explains: bool
+def test_a_contact_explains_a_fall_and_the_refusals_to_arm_after_it_but_no_other_end(
+    explained: str, before: str, raised: set[str], refused: bool, expected: str
 ) -> None:
-    assert contact_explains(raised, refused=refused) is explains
+    assert explained_end(explained, before, raised, refused=refused) == expected
