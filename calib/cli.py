@@ -19,7 +19,7 @@ JOBS: Final[Mapping[str, tuple[str, str]]] = {
 
 EXAMPLES: Final = """examples:
   edge-calib latency --artifacts out/nano --out orin.latency.json
-  edge-calib odometry flight.mcap --out go2.odometry.toml
+  edge-calib odometry flight.mcap --robot go2.toml --out go2.odometry.toml
   edge-calib power --artifacts out/nano --out orin.power.toml
 exit codes: 0 done, 1 what was measured is not good enough to be used, 2 bad arguments or input, 3 refused: the device
 cannot be measured, 130 interrupted

@@ -17,6 +17,7 @@ from edge.core.cli import (
     EXIT_BAD_INPUT,
     EXIT_CHECK_FAILED,
     EXIT_DONE,
+    EXIT_REFUSED,
     check_result_target,
     command_line,
     messages,
@@ -25,6 +26,7 @@ from edge.core.cli import (
 )
 from edge.core.device import read_device
 from edge.core.stats import percentiles
+from edge.inference.engines import EngineError, with_built_engines
 from edge.inference.graph import GraphError
 from edge.inference.latency_profile import LatencyError, LatencyProfile, load_profile
 from edge.power.meters.meter import MEASURED
@@ -72,7 +74,10 @@ _print = messages("edge-calib latency")
 _BAD_INPUT = (ArtifactError, GraphError, LatencyError, CalibrationError, InstructionError, OSError, ValueError)
 
 
-@command_line("edge-calib latency", {MeasureError: EXIT_CHECK_FAILED, **dict.fromkeys(_BAD_INPUT, EXIT_BAD_INPUT)})
+@command_line(
+    "edge-calib latency",
+    {MeasureError: EXIT_CHECK_FAILED, EngineError: EXIT_REFUSED, **dict.fromkeys(_BAD_INPUT, EXIT_BAD_INPUT)},
+)
 def run(args: argparse.Namespace) -> int:
     """Measure generation times or read them from a log, write the profile and return the exit code."""
     _check(args)
@@ -115,7 +120,7 @@ def _check(args: argparse.Namespace) -> None:
 
 
 def _measured(args: argparse.Namespace) -> tuple[LatencyProfile, Measured]:
-    artifacts = load_artifacts(args.artifacts)
+    artifacts = with_built_engines(load_artifacts(args.artifacts.absolute()))
     if args.mode == Mode.NO_REASONING.value and artifacts.guided_by_waypoints:
         raise ValueError(f"--mode {args.mode}: {args.artifacts} is guided by the waypoints that reasoning writes")
     clip = load_calibration(args.calibration).clips[0]

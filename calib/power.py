@@ -28,6 +28,7 @@ from edge.core.cli import (
 )
 from edge.core.device import read_device
 from edge.core.sysfs import SYSFS
+from edge.inference.engines import EngineError, with_built_engines
 from edge.inference.graph import GraphError
 from edge.power.governor.plan import STAGES, PowerModel, PowerPlan, read_power_plan
 from edge.power.meters.meter import MEASURED, MODELLED, MeterError, ModelledMeter, PowerMeter
@@ -67,13 +68,18 @@ _BAD_INPUT = (ArtifactError, GraphError, TargetError, KeyError, OSError, ValueEr
 
 @command_line(
     "edge-calib power",
-    {MeterError: EXIT_REFUSED, FitError: EXIT_CHECK_FAILED, **dict.fromkeys(_BAD_INPUT, EXIT_BAD_INPUT)},
+    {
+        MeterError: EXIT_REFUSED,
+        EngineError: EXIT_REFUSED,
+        FitError: EXIT_CHECK_FAILED,
+        **dict.fromkeys(_BAD_INPUT, EXIT_BAD_INPUT),
+    },
 )
 def run(args: argparse.Namespace, sysfs_root: Path = SYSFS) -> int:
     """Measure, fit, write; returns the exit code."""
     check_result_target(args.json)
     _check(args)
-    artifacts = load_artifacts(args.artifacts)
+    artifacts = with_built_engines(load_artifacts(args.artifacts.absolute()))
     power = read_power_plan(artifacts)
     manifest = read_manifest(args.artifacts)
     target = parse_target(manifest["provenance"]["target"], f"{args.artifacts}: the target in its manifest")

@@ -54,11 +54,12 @@ table inet {TABLE} {{
         elements = {{ {robot} }}
     }}
 
-    # Only the services' users send, and only to the robot. Root is let through: it could remove this table.
+    # Only the services' users send, and only to the robot. Root is let through: it could remove this table. The robot's
+    # DDS may take any port above 1023: Cyclone's default leaves the choice to the kernel.
     chain output {{
         type filter hook output priority filter; policy accept;
         oifname != {cable} accept
-        meta skuid {{ {senders} }} ip daddr @robot {dds} accept
+        meta skuid {{ {senders} }} ip daddr @robot udp dport 1024-65535 accept
         meta skuid {{ {senders} }} ip daddr {MULTICAST.network_address} {dds} accept
         meta l4proto igmp accept
         ip daddr @robot icmp type {{ echo-request, echo-reply, destination-unreachable }} accept

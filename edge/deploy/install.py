@@ -31,8 +31,9 @@ EXAMPLES = """examples:
   edge-install engines --artifacts out/orin
   edge-install engines --artifacts out/orin --engines /var/lib/tic-vla/engines --json -
   edge-install units --artifacts out/orin --robot go2.toml --instruction "walk to the vending machine" --out units
-  sudo edge-install units --artifacts /opt/tic-vla-edge/current/artifacts --robot /etc/tic-vla-edge/go2.toml \\
-       --target orin --instruction-file /etc/tic-vla-edge/instruction.txt --network 192.168.123.161/32 --system
+  sudo edge-install units --home /opt/tic-vla-edge --artifacts /opt/tic-vla-edge/current/artifacts \\
+       --robot /etc/tic-vla-edge/go2.toml --instruction-file /etc/tic-vla-edge/instruction.txt \\
+       --network 192.168.123.161/32 --system
   edge-install dds
   sudo edge-install board --wheel tic_vla_edge-0.1.0-py3-none-any.whl --artifacts out/cpu --extras cpu,unitree
   sudo edge-install rollback

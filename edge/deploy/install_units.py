@@ -192,6 +192,12 @@ def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
             f"robot file {args.robot}: safety.operator_arm: expected true, found false: the service would drive as "
             f"soon as it starts; set it to true, or give --arm-at-start if you want that"
         )
+    links = [path for path in args.artifacts.absolute().parents if path.name == LINK and path.is_symlink()]
+    if args.home is None and links:
+        raise UnitError(
+            f"--artifacts {args.artifacts}: leads through {links[0]}: expected --home {links[0].parent}, found none; "
+            f"without it the services stay on this release, which a later update removes"
+        )
     # A path through the link of the releases stays one, so that an update changes programs and artifacts together.
     through_link = args.home is not None and args.artifacts.absolute().is_relative_to(args.home.absolute() / LINK)
     artifacts = load_artifacts(args.artifacts.absolute() if through_link else Path(os.path.realpath(args.artifacts)))
@@ -307,6 +313,7 @@ def _report_firewall(inputs: units.ServiceInputs, say: Callable[[str], None]) ->
         return
     if inputs.nft is None:
         say("nft is not on this machine, so nothing loads the firewall: sudo apt install nftables, then run this again")
+    say("the firewall ends every SSH session over the robot's cable: run the commands over another interface")
     wide = [network for network in inputs.networks if network.prefixlen < 32]
     if wide:
         say(

@@ -32,6 +32,7 @@ _ADVICE: Final = {
     "ensurepip is not available": "sudo apt-get install python3-venv, then run this again",
     "certificate is not yet valid": "the clock is wrong: set it (timedatectl), or install offline with --wheels DIR",
     "No module named 'onnxruntime'": "no ONNX Runtime: give --extras cpu, or on a Jetson --with onnxruntime-gpu",
+    "libraries are missing or do not load": "on a Jetson: sudo apt-get install nvidia-jetpack, then run this again",
     "does not match the hash": "the wheel or the index is not the expected one",
 }
 """What to do about an error line of pip, venv or a check; `dds_binding.explained` knows the compilers'."""

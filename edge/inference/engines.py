@@ -96,6 +96,18 @@ def with_engines(artifacts: Artifacts, directory: Path) -> Artifacts:
     return dataclasses.replace(artifacts, graphs=graphs)
 
 
+def with_built_engines(artifacts: Artifacts) -> Artifacts:
+    """Return the artifacts with the engines built beside them, or as they are where none is needed.
+
+    Raises EngineError where one is missing or was built for something else.
+    """
+    if not needed(artifacts):
+        return artifacts
+    folder = default_directory(artifacts.directory)
+    check(artifacts, folder)
+    return with_engines(artifacts, folder)
+
+
 def _redirected(artifacts: Artifacts, name: str, folder: Path) -> Any:
     graph = artifacts.graphs[name]
     keys = _CACHE_OPTIONS.get(graph.session.provider)

@@ -27,14 +27,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("directory", type=Path, metavar="DIR", help="artifact directory")
     args = parser.parse_args(argv)
     try:
-        artifacts = load_artifacts(args.directory.absolute())
-        if engines.needed(artifacts):
-            folder = engines.default_directory(artifacts.directory)
-            engines.check(artifacts, folder)
-            artifacts = engines.with_engines(artifacts, folder)
+        artifacts = engines.with_built_engines(load_artifacts(args.directory.absolute()))
     except (ArtifactError, engines.EngineError) as error:
         sys.stderr.write(f"edge-export: {one_line(error)}\n")
-        return EXIT_REFUSED
+        return EXIT_CHECK_FAILED if isinstance(error, ArtifactError) else EXIT_REFUSED
     tested, opened = self_test(artifacts)
     checks = [tested]
     if opened is not None:  # a graph that fails may also loop
