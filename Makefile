@@ -15,19 +15,20 @@ PYTEST := $(BIN)/python -m pytest
 SINGLE := OMP_NUM_THREADS=1 $(PYTEST)
 PARALLEL := $(SINGLE) -n $(WORKERS) --dist loadfile
 PROCESS_FILES = $(shell grep -rlF --include='test_*.py' mark.process tests)
+PROPERTY_FILES = $(shell grep -rlE --include='test_*.py' 'given|stateful' tests)
 # Tests of processes mostly wait, so isolated ones run beside them, with the lowest priority. They share a folder, so that
-# the model is exported once. $(1): the tests' name, $(2): options, $(3): marker, $(4): what runs beside, $(5): afterwards.
-tiers = @folder=$$(mktemp -d) && export EDGE_TEST_FOLDER="$$folder" && \
-	trap 'kill $$isolated 2>/dev/null; wait $$isolated; rm -rf "$$folder"' EXIT && \
-	{ nice -n 19 env $(4) $(2) -m "$(3)not process" > "$$folder/isolated.log" 2>&1 & } && isolated=$$!; \
+# the model is exported once: EDGE_TEST_FOLDER, or one of their own. $(1): the tests' name, $(2): options, $(3): marker,
+# $(4): the file that holds all but one of the isolated tests' workers as long as it exists.
+tiers = @own=; test -n "$$EDGE_TEST_FOLDER" || own=$$(mktemp -d) && folder=$${EDGE_TEST_FOLDER:-$$own} && \
+	export EDGE_TEST_FOLDER="$$folder" && $(if $(4),touch "$$folder/$(4)" &&) \
+	trap 'kill $$isolated 2>/dev/null; wait $$isolated; rm -rf $$own' EXIT && \
+	{ nice -n 19 env $(PARALLEL) $(2) -m "$(3)not process" > "$$folder/isolated.log" 2>&1 & } && isolated=$$!; \
 	echo "== $(1) tests of processes, one at a time" && \
-	{ $(PYTEST) $(2) -m "$(3)process and not repeated" $(PROCESS_FILES); processes=$$?; } ; \
+	{ $(PYTEST) $(2) -m "$(3)process and not repeated" $(PROCESS_FILES); processes=$$?; rm -f "$$folder/one-worker"; } ; \
 	wait $$isolated; code=$$?; isolated=; \
-	echo "== isolated $(1) tests" && cat "$$folder/isolated.log" && \
-	$(if $(5),{ $(5) $(2) -m "$(3)not process" || code=1; } &&) test $$processes = 0 && test $$code = 0
-# Slow tests of processes drive robots in real time: they leave one core to a single process of these tests.
-BESIDE := tests/calib tests/edge tests/firmware_bridge tests/process
-slow_tiers = $(call tiers,$(1),--durations=15,$(2),$(SINGLE) $(BESIDE),$(PARALLEL) $(BESIDE:%=--ignore=%) tests)
+	echo "== isolated $(1) tests" && cat "$$folder/isolated.log" && test $$processes = 0 && test $$code = 0
+# Slow tests of processes drive robots in real time: they leave one core to a single worker of the others.
+slow_tiers = $(call tiers,$(1),--durations=15,$(2),one-worker)
 # Tests start hundreds of processes; without compiled modules on the disk each would compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
@@ -61,10 +62,11 @@ help:
 	@$(call install,export$(comma)sim$(comma)live)
 	@touch $@
 
-.venv/.test-installed: .venv/.demo-installed
+# The extra dev brings the demo's live with it: one install serves both.
+.venv/.test-installed: pyproject.toml constraints.txt | .venv/bin/python
 	@echo "make: installing the test packages into .venv, once; log: .venv/install.log" >&2
 	@$(call install,export$(comma)sim$(comma)dev)
-	@touch $@
+	@touch .venv/.demo-installed $@
 
 demo: .venv/.demo-installed
 	@$(BIN)/python -m tools.demo --robot $(ROBOT) --out out/demo --duration $(DURATION) --seed $(SEED) --people $(PEOPLE) $(if $(LIVE),--live)
@@ -106,7 +108,7 @@ lint: .venv/.test-installed
 	$(BIN)/mypy
 
 test: lint
-	$(call tiers,fast,,not slow and ,$(PARALLEL))
+	$(call tiers,fast,,not slow and )
 
 test-slow: .venv/.test-installed
 	$(call slow_tiers,slow,slow and )
@@ -115,7 +117,7 @@ test-slow: .venv/.test-installed
 test-random: .venv/.test-installed
 	@seed=$(SEED); test "$$seed" -ne 0 || seed=$$($(PYTHON) -c "import secrets; print(1 + secrets.randbelow(2**31))"); \
 	echo "== property tests with the random seed $$seed; repeat them with: make test-random SEED=$$seed"; \
-	$(PARALLEL) -m "hypothesis and not process" --timeout 600 --hypothesis-profile=random --hypothesis-seed=$$seed
+	$(PARALLEL) $(PROPERTY_FILES) -m "hypothesis and not process" --timeout 600 --hypothesis-profile=random --hypothesis-seed=$$seed
 
 test-all: lint
 	$(call slow_tiers,all,)

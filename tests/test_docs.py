@@ -33,7 +33,10 @@ TARGET = re.compile(r"^\s*make ([a-z][a-z-]*)")
 MODULE = re.compile(r"-m ((?:" + "|".join(FOLDERS) + r")(?:\.\w+)+)")
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9-]*")
 REPOSITORY_PATH = re.compile(r"(?<![\w./~-])(?:" + "|".join(FOLDERS) + r")/[\w./-]*")
-OTHER_PROGRAM = re.compile(r"(?<![\w-])(?:ray|torchrun|pip|apt-get|docker|nft|git|ls|sed|systemctl|systemd-run|systemd-tmpfiles|ros2 topic|ros2 param) ")
+OTHER_PROGRAM = re.compile(
+    r"(?<![\w-])(?:ray|torchrun|pip|apt-get|docker|nft|git|ls|sed|systemctl|systemd-run|systemd-tmpfiles"
+    r"|ros2 topic|ros2 param) "
+)
 
 
 @dataclass(frozen=True)

@@ -150,7 +150,7 @@ class OperatorMachine(RuleBasedStateMachine):
         assert code in (0, 1, 3) and said.startswith("edge-bridge: ")
         if self.desk.line in ("refuses", "denies"):
             assert code == 3 and "error" in result
-            assert ("NOT stopped" in said) == (command == "stop" and self.desk.line == "denies")
+            assert ("NOT stopped" in said) == (command == "stop")
         return code, result, said
 
     @rule()
@@ -250,15 +250,8 @@ def run(max_examples: int) -> None:
 
 
 @pytest.mark.slow
-def test_what_an_operator_is_told_is_true() -> None:
-    run(8)
-    assert OperatorMachine.commands >= 60
-    assert OperatorMachine.confirmed_stops >= 10 and OperatorMachine.confirmed_arms >= 3
-
-
-@pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_the_same_over_a_hundred_thousand_steps() -> None:
+def test_what_an_operator_is_told_is_true_over_a_hundred_thousand_steps() -> None:
     run(40)
-    assert World.core_steps >= 100_000
+    assert World.core_steps >= 100_000 and OperatorMachine.commands >= 300
     assert OperatorMachine.confirmed_stops >= 40 and OperatorMachine.confirmed_arms >= 8
