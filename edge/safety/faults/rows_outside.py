@@ -255,7 +255,7 @@ START: tuple[Fault, ...] = (
     Fault(
         "unsafe-robot", 58, Action.STOP, 0, "start",
         "The robot's own protection, such as a failsafe parameter, is weaker than the robot file requires.",
-        "Correct on the robot what edge-bridge status names, then restart the bridge.",
+        "Correct on the robot what edge-bridge status names, then start the runner again.",
         "tests/edge/robot/test_operator_arm.py::TestBridge::test_a_robot_whose_own_protection_is_weak_is_not_armed",
     ),
     Fault(
