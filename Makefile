@@ -21,7 +21,7 @@ PROPERTY_FILES = $(shell grep -rlE --include='test_*.py' 'given|stateful' tests)
 # $(4): the file that holds all but one of the isolated tests' workers as long as it exists.
 tiers = @own=; test -n "$$EDGE_TEST_FOLDER" || own=$$(mktemp -d) && folder=$${EDGE_TEST_FOLDER:-$$own} && \
 	export EDGE_TEST_FOLDER="$$folder" && $(if $(4),touch "$$folder/$(4)" &&) \
-	trap 'kill $$isolated 2>/dev/null; wait $$isolated; rm -rf $$own' EXIT && \
+	trap 'kill $$isolated 2>/dev/null; wait $$isolated; rm -rf $$own "$$folder/one-worker"' EXIT && trap 'exit 130' INT TERM && \
 	{ nice -n 19 env $(PARALLEL) $(2) -m "$(3)not process" > "$$folder/isolated.log" 2>&1 & } && isolated=$$!; \
 	echo "== $(1) tests of processes, one at a time" && \
 	{ $(PYTEST) $(2) -m "$(3)process and not repeated" $(PROCESS_FILES); processes=$$?; rm -f "$$folder/one-worker"; } ; \
@@ -115,7 +115,7 @@ test-slow: .venv/.test-installed
 
 # Shrinking a failing example takes up to 5 minutes: longer than the usual time limit of a test.
 test-random: .venv/.test-installed
-	@seed=$(SEED); test "$$seed" -ne 0 || seed=$$($(PYTHON) -c "import secrets; print(1 + secrets.randbelow(2**31))"); \
+	@rm -f "$${EDGE_TEST_FOLDER:-.}/one-worker"; seed=$(SEED); test "$$seed" -ne 0 || seed=$$($(PYTHON) -c "import secrets; print(1 + secrets.randbelow(2**31))"); \
 	echo "== property tests with the random seed $$seed; repeat them with: make test-random SEED=$$seed"; \
 	$(PARALLEL) $(PROPERTY_FILES) -m "hypothesis and not process" --timeout 600 --hypothesis-profile=random --hypothesis-seed=$$seed
 

@@ -66,9 +66,10 @@ stop, arm, release and status look for a bridge at the installed service's socke
 member of tic-vla-operators) and at the robot file's, or at --socket only. With a robot file that cannot be used, stop
 looks at the usual places.
 exit codes: 0 ended by a signal or the terminal's end, robot stopped (stop, arm, release, status: done); 1 internal
-failure, robot stopped (stop: the robot has not reported that it stands still; use its remote); 2 bad arguments or robot
-file; 3 refused: another bridge owns the socket (stop, arm, release, status: no bridge is running, or none that this
-user may reach; arm: no runner waits, or more than one bridge); 130 interrupted (stop, arm, release, status)"""
+failure, robot stopped (stop: the robot has not reported that it stands still, or another bridge has died or cannot be
+reached; use the remote); 2 bad arguments or robot file; 3 refused: another bridge owns the socket (stop, arm,
+release, status: no bridge is running, or none that this user may reach; arm: no runner waits, or more than one
+bridge); 130 interrupted (stop, arm, release, status)"""
 
 
 class Bridge:

@@ -92,9 +92,11 @@ def operate(command: str, *sockets: Path, say: Say = _write) -> tuple[int, dict[
         say(f"{status.state}: {status.reason}{blocked}")
     if command == "arm" and any(status.permit == "not needed" for status in statuses):
         say("no permission is needed: the runner arms by itself")
-    for error in hidden:
-        died = f"; its robot is NOT stopped: {_USE_REMOTE}, then remove that file" if _has_died(error) else ""
-        say(f"{one_line(error)}{died}")
+    for socket, answer in answers.items():
+        if answer in hidden:
+            died = isinstance(answer, BridgeUnavailable) and _has_died(answer)
+            advice = f"its robot is NOT stopped: {_USE_REMOTE}; then start that bridge again"
+            say(f"the bridge of {socket} has died: {advice}" if died else one_line(answer))
     for answer in unconfirmed:
         say(_why_unconfirmed(command, answer.status))
     values = statuses[0] if statuses else next((answer.status for answer in unconfirmed if answer.status), None)
@@ -140,7 +142,7 @@ def _at_each(command: str, say: Say, *sockets: Path) -> dict[Path, Answer]:
 
 def _operate(command: str, say: Say, socket: Path) -> Answer:
     """Connect and send; a stop is repeated until CONFIRM_S has passed, whatever ends a connection."""
-    deadline_ns = time.monotonic_ns() + round(CONFIRM_S * 1e9)
+    deadline_ns, died = time.monotonic_ns() + round(CONFIRM_S * 1e9), None
     while True:
         try:
             # A bridge that does not run now reads the stop as soon as it runs again.
@@ -150,9 +152,11 @@ def _operate(command: str, say: Say, socket: Path) -> Answer:
             finally:
                 client.close()
         except BridgeUnavailable as error:
-            absent = isinstance(error.__cause__, (FileNotFoundError, PermissionError))
+            died = error if _has_died(error) else died
+            # A bridge that starts again removes the socket of the one that was killed before it makes its own.
+            absent = isinstance(error.__cause__, (FileNotFoundError, PermissionError)) and died is None
             if command != "stop" or absent or time.monotonic_ns() >= deadline_ns:
-                return error
+                return died or error
             time.sleep(_POLL_S)
 
 

@@ -192,7 +192,8 @@ def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
             f"robot file {args.robot}: safety.operator_arm: expected true, found false: the service would drive as "
             f"soon as it starts; set it to true, or give --arm-at-start if you want that"
         )
-    links = [path for path in args.artifacts.absolute().parents if path.name == LINK and path.is_symlink()]
+    above = args.artifacts.absolute().parents
+    links = [path for path in above if path.name == LINK and path.is_symlink() and (path / "venv/bin").is_dir()]
     if args.home is None and links:
         raise UnitError(
             f"--artifacts {args.artifacts}: leads through {links[0]}: expected --home {links[0].parent}, found none; "

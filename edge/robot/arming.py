@@ -118,11 +118,12 @@ def arm(
     StoppedEarlyError or BridgeUnavailable.
     """
     gate = _Gate(obstacle, operator, clock, say)
-    if stop_requested():
-        raise StoppedEarlyError("stopped before the robot was armed")
-    while not gate.is_clear(bridge.poll()):
+    while True:
+        clear = gate.is_clear(bridge.poll())
         if stop_requested():
             raise StoppedEarlyError("stopped before the robot was armed")
+        if clear:
+            break
         if operator:
             on_wait(f"{WAITING} ({gate.why})")
         sleep(POLL_S)

@@ -149,12 +149,12 @@ def decode(data: bytes) -> Message:
         raise LinkError(f"{len(data)} bytes, shorter than a header")
     magic, version, kind, length = _HEADER.unpack_from(data)
     body = data[_HEADER.size :]
+    if (magic, kind, length) == (MAGIC, _STOP, 0) and not body:
+        return Stop()  # of any version: during an update the operator's program is newer than the running bridge
     if (magic, version) != (MAGIC, VERSION) or length != len(body):
         raise LinkError(f"magic {magic!r}, version {version}, length {length} of {len(body)}")
     if kind == _ARM and not body:
         return Arm()
-    if kind == _STOP and not body:
-        return Stop()
     if kind == _RELEASE and not body:
         return Release()
     if kind == _VELOCITY and len(body) == _VELOCITY_BODY.size:

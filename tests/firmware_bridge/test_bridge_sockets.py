@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
@@ -94,14 +95,18 @@ class TestOperate:
         with answering(mine) as (bridge,):
             assert operate("stop", dead, mine)[0] == 1
         assert Stop() in bridge.received
-        told = capsys.readouterr().err
-        assert str(dead) in told and "its robot is NOT stopped" in told
+        assert f"the bridge of {dead} has died: its robot is NOT stopped" in capsys.readouterr().err
 
-    def test_a_bridge_that_starts_again_within_a_second_takes_the_stop(self, tmp_path: Path) -> None:
+    @pytest.mark.parametrize("gap_s", [0.0, 0.05], ids=["at once", "after its socket was absent for 50 ms"])
+    def test_a_bridge_that_starts_again_within_a_second_takes_the_stop(self, gap_s: float, tmp_path: Path) -> None:
         path = tmp_path / "service"
         left_behind(path)
         with ExitStack() as stack, ThreadPoolExecutor(1) as pool:
             code = pool.submit(operate, "stop", path)
+            time.sleep(0.05)
+            if gap_s:
+                Path(f"{path}{OPERATOR_SUFFIX}").unlink()
+                time.sleep(gap_s)
             (bridge,) = stack.enter_context(answering(path))
             assert code.result()[0] == 0
         assert Stop() in bridge.received

@@ -53,11 +53,14 @@ class Ros2Camera:
     def request_frame(self, timeout_s: float) -> bytes:
         """See `CameraSource`."""
         data, captured_ns = self._newest.take(timeout_s)
+        before_ns = self.header_stamp_ns
         try:
             jpeg, self.header_stamp_ns = raw_picture(data) if self._raw else compressed_picture(data)
         except CameraError as error:
             raise CameraError(f"camera {self._newest.name}: {error}") from error
-        self.captured_ns = captured_ns - self._lag.of(captured_ns, self.header_stamp_ns or 0)
+        # Some drivers never change the stamp: it tells nothing then.
+        stamp_ns = 0 if self.header_stamp_ns in (None, before_ns) else self.header_stamp_ns
+        self.captured_ns = captured_ns - self._lag.of(captured_ns, stamp_ns or 0)
         return jpeg
 
     def close(self) -> None:

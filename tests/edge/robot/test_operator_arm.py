@@ -256,6 +256,17 @@ class TestRunner:
             runner.run()
         assert runner.asked_ms == [] and runner.bench.status.state == "disarmed"
 
+    def test_a_stop_at_the_moment_at_which_nothing_is_in_the_way_any_more_sends_none(self) -> None:
+        runner = Runner(Bench(), obstacle="dark")
+
+        def clear_and_stop() -> None:
+            runner.obstacle, runner.stop = "", True
+
+        runner.at_ms[1_000] = clear_and_stop
+        with pytest.raises(StoppedEarlyError, match="before the robot was armed"):
+            runner.run()
+        assert runner.asked_ms == []
+
     def test_without_operator_arm_nothing_is_waited_for(self) -> None:
         runner = Runner(Bench())
         runner.run()

@@ -126,6 +126,13 @@ def test_kinds_layout_and_size_are_those_of_version_4() -> None:
     assert (MAX_DATAGRAM_BYTES, MAX_REASON_BYTES) == (512, 400)
 
 
+def test_a_stop_of_another_version_is_a_stop() -> None:
+    stop = bytearray(encode(Stop()))
+    for version in range(256):
+        stop[4] = version
+        assert decode(bytes(stop)) == Stop()
+
+
 def test_a_cause_keeps_its_number_within_a_version() -> None:
     assert (
         *("none", "client_stop", "client_lost", "deadman", "shutdown", "suspended", "estop", "remote_takeover"),

@@ -118,10 +118,30 @@ class TestSimulatedCamera:
         assert "no new picture" in error_of(camera, 0.1)
 
 
-def test_the_stamp_of_another_machine_is_not_of_this_clock(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Elsewhere:
-        is_loopback = False
+class Elsewhere:
+    """The address of another machine."""
 
+    is_loopback = False
+
+
+def test_a_picture_of_another_machine_that_came_late_is_older(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mjpeg.ipaddress, "ip_address", lambda _address: Elsewhere)
+    server: Server
+
+    def answer(connection: socket.socket) -> None:
+        connection.sendall(HEAD + part(JPEG_A, more="X-Capture-Ns: 10000000000\r\n"))
+        time.sleep(0.5)
+        connection.sendall(part(JPEG_B, more="X-Capture-Ns: 10050000000\r\n"))  # 450 ms in a queue
+        server.closing.wait(5.0)
+
+    server = Server(answer)
+    with closing(server), closing(camera_of(server)) as camera:
+        assert camera.request_frame(5.0) == JPEG_A and camera.request_frame(5.0) == JPEG_B
+        assert camera.captured_ns is not None
+        assert camera.captured_ns <= time.monotonic_ns() - LATENCY_NS - 400_000_000
+
+
+def test_the_stamp_of_another_machine_is_not_of_this_clock(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mjpeg.ipaddress, "ip_address", lambda _address: Elsewhere)
     with (
         closing(served(HEAD + part(JPEG_A, more="X-Capture-Ns: 5\r\n"))) as server,

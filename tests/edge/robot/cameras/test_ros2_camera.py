@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge.robot.camera import decode_frame
+from edge.robot.cameras import ros2 as module
 from edge.robot.cameras.ros2 import Ros2Camera
 from edge.robot.cameras.ros2_pictures import compressed_picture, raw_picture
 from firmware_bridge.core.config import ConfigError, DdsConfig
@@ -148,6 +149,23 @@ def test_a_picture_arrives_as_it_was_sent_with_its_stamps(shared: SharedBus) -> 
         assert frames_of(camera, lambda: writer.write(compressed(sent))) == sent
         assert camera.header_stamp_ns == 3_500_000_000 and camera.captured_ns is not None
         assert LATENCY_NS <= time.monotonic_ns() - camera.captured_ns < LATENCY_NS + 5_000_000_000
+
+
+@pytest.mark.parametrize(
+    ("stamps_s", "older_s"), [((3, 4), 0.0), ((3, 3.1), 0.9), ((3, 3), 0.0)], ids=["in time", "held back", "constant"]
+)
+def test_a_picture_that_the_network_holds_back_is_older_by_its_stamp(
+    stamps_s: tuple[float, float], older_s: float, monkeypatch: pytest.MonkeyPatch, shared: SharedBus
+) -> None:
+    arrivals = iter((100_000_000_000, 101_000_000_000))
+    with closing(Ros2Camera(shared, "/image", raw=False)) as camera:
+        monkeypatch.setattr(camera._newest, "take", lambda _timeout_s: (b"", next(arrivals)))
+        stamps = iter(stamps_s)
+        monkeypatch.setattr(module, "compressed_picture", lambda _data: (b"", round(next(stamps) * 1e9)))
+        for _ in stamps_s:
+            camera.request_frame(0.0)
+        assert camera.captured_ns is not None
+        assert 101.0 - camera.captured_ns / 1e9 == pytest.approx(older_s, abs=0.001)
 
 
 def test_only_the_newest_picture_is_returned_and_once(shared: SharedBus) -> None:
