@@ -262,6 +262,6 @@ def test_after_an_emergency_stop_nothing_moves_the_robot_without_an_operator() -
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_the_same_over_a_hundred_thousand_steps() -> None:
-    run(160)
+    run(180)
     assert World.core_steps >= 100_000 and BridgeMachine.rules_run >= 13_000
     assert BridgeMachine.latched_runs > 2_400 and BridgeMachine.drives > 120

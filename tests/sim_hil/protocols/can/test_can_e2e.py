@@ -133,7 +133,7 @@ def test_a_velocity_beyond_the_range_is_sent_as_the_end_of_the_range(vx: float) 
     for _ in range(2):
         received = decoder.decode(encoder.encode("VelocityCommand", Vx=vx, Wz=0.0))
     assert received is not None
-    assert received.signals["Vx"] == pytest.approx(max(-32.768, min(32.767, vx)), abs=0.0005)
+    assert received.signals["Vx"] == pytest.approx(max(-32.768, min(32.767, vx)), abs=0.00051)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
