@@ -377,7 +377,7 @@ def test_a_release_survives_its_own_record(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.process
+@pytest.mark.timeout(600)  # pip downloads and unpacks beside the tests of processes
 def test_the_real_command_installs_this_package_and_its_runner_starts(
     artifacts_dir: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
