@@ -136,7 +136,7 @@ def test_a_domain_is_surveyed_by_discovery_and_by_counting(dds_domain: int) -> N
     node = threading.Thread(target=publish)
     node.start()
     try:
-        checks = ros2_topics(config, lambda of, uses: survey_domain(of, uses, measure_s=1.2))
+        checks = ros2_topics(config, lambda of, uses: survey_domain(of, uses, measure_s=3.0))
     finally:
         ended.set()
         node.join()
