@@ -9,6 +9,7 @@ import contextlib
 import fcntl
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -55,7 +56,10 @@ def running(
     stderr = folder / f"{module}.stderr"
     with stderr.open("wb") as file:
         command = [python, "-m", module, *map(str, arguments)]
+        # As a terminal starts it: under nohup it would inherit that SIGHUP is ignored, and keep it so.
+        hangup = signal.signal(signal.SIGHUP, signal.SIG_DFL)
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=file, cwd=REPOSITORY)
+        signal.signal(signal.SIGHUP, hangup)
     started = Running(process, stderr)
     try:
         try:
