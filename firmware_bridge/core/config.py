@@ -149,9 +149,9 @@ class RobotConfig:
 
     @property
     def digest(self) -> int:
-        """64 bits of the robot's name, protocol and address: runner and bridge must mean the same robot."""
+        """63 bits of the robot's name, protocol and address: runner and bridge must mean the same robot."""
         text = "\0".join((self.name, self.protocol, self.address))
-        return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little")
+        return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little") >> 1  # fits JSON
 
 
 def load_robot_config(path: Path | str, *, socket: Path | None = None, domain: int | None = None) -> RobotConfig:

@@ -8,6 +8,8 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from edge.robot.arming import RefusedError, arm, check_bridge, disarm
 from firmware_bridge.client import BridgeStatus, BridgeUnavailable
@@ -226,6 +228,11 @@ def test_a_bridge_with_the_same_robot_file_is_accepted() -> None:
     robot = load_robot_config(GO2_SIM)
     check_bridge(replace(status(0), robot=robot.digest), robot)
     check_bridge(None, robot)
+
+
+@given(st.text())
+def test_a_robots_digest_fits_the_bridges_json_result(name: str) -> None:
+    assert 0 <= replace(load_robot_config(GO2_SIM), name=name).digest < 2**63
 
 
 @pytest.mark.parametrize(
