@@ -59,7 +59,7 @@ class Ros2Camera:
         except CameraError as error:
             raise CameraError(f"camera {self._newest.name}: {error}") from error
         # Some drivers never change the stamp: it tells nothing then.
-        stamp_ns = 0 if self.header_stamp_ns in (None, before_ns) else self.header_stamp_ns
+        stamp_ns = None if self.header_stamp_ns == before_ns else self.header_stamp_ns
         self.captured_ns = captured_ns - self._lag.of(captured_ns, stamp_ns or 0)
         return jpeg
 
