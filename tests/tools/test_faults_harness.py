@@ -269,6 +269,7 @@ def switched(tmp_path: Path):
 def test_a_fault_takes_effect_when_its_code_runs_for_the_given_time(switched, after: int) -> None:
     switches, client = switched
     client.ask("one", seconds_s=2.0, after=after)
+    client.inject("two", on=False)  # answered at once, and after what was asked before: the first request has arrived
     with pytest.raises(FaultError, match="no effect"):
         client.effect_ns("one", 0.1)
     assert switches.hit("two") is None
