@@ -70,13 +70,17 @@ class Ros2Config(Section):
                 check_topic_name(f"ros2.{key}", name)
                 earlier = used.setdefault(self.topic(name), key)
                 require(earlier == key, f"ros2.{key}: expected a topic of its own, found that of ros2.{earlier}")
-        stops = 0 < self.base_timeout_ms <= LONGEST_BASE_TIMEOUT_MS
         require(
-            stops or self.supervised,
+            self.stops_itself or self.supervised,
             f"ros2.base_timeout_ms: expected 1..{LONGEST_BASE_TIMEOUT_MS}, found {self.base_timeout_ms}: the base"
             " drives on when the bridge dies; give the base a command timeout, or write ros2.supervised = true and keep"
             " a person at the base's own emergency stop",
         )
+
+    @property
+    def stops_itself(self) -> bool:
+        """Whether the base stops soon enough by itself when no command comes."""
+        return 0 < self.base_timeout_ms <= LONGEST_BASE_TIMEOUT_MS
 
     @property
     def reliable_inputs(self) -> bool:

@@ -14,7 +14,8 @@ class RobotTable:
     report before it is made ready; None: the protocol has none. `ready_modes`: modes in which arming is complete.
     `armed_modes`: modes in which an armed robot may be; any other mode stops it. `moving_modes`: modes that imply
     motion. `next_step`: step that brings a robot in this mode nearer to a ready one; other modes get `recovery_step`.
-    `repeat_ns`: time after which a step without effect is requested again.
+    `repeat_ns`: time after which a step without effect is requested again. `holds_command`: the base never stops by
+    itself, or late: it may hold the last command of an earlier bridge, also one that it could not follow yet.
     """
 
     identity: str
@@ -27,6 +28,7 @@ class RobotTable:
     step_names: Mapping[int, str]
     mode_names: Mapping[int, str] = field(default_factory=dict)
     repeat_ns: int = 3_000_000_000
+    holds_command: bool = False
 
     def __post_init__(self) -> None:
         if not self.ready_modes <= self.armed_modes:

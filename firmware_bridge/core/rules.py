@@ -1,8 +1,9 @@
 """The bridge's rules, without clock, socket or protocol: `BridgeCore.step(inputs, now_ns) -> Outputs`.
 
 States: disarmed -> arming -> armed -> stopped -> (explicit arm) arming ...
-* disarmed: the bridge sends nothing, with two exceptions: a robot found moving when the bridge starts is stopped, and
-  so is a robot that moves when an emergency stop is pressed (also after an arming that was broken off).
+* disarmed: the bridge sends nothing, with two exceptions. A robot found moving when the bridge starts is stopped, and a
+  base that holds its last command gets zeros then. An emergency stop of this computer sends a zero and a StopMotion; a
+  robot that moves when any is pressed is stopped (also after an arming that was broken off).
 * arming: the robot names its version and is made ready step by step, each confirmed by the mode it reports. A danger
   or a time-out refuses with a reason.
 * armed: the newest good command goes out at the bridge's own rate through limits and slew.
@@ -80,6 +81,8 @@ class BridgeCore:
         self._had_client = self._ever_armed = self._released = False
         self._pressed = (False, False, False, False)
         self._pressed_ns = _NEVER_NS
+        self._press_sent_ns = _NEVER_NS
+        self._pressed_here = False  # in this step, by an operator or at the local input
         self._asleep_ns: int | None = None
         self._stop_sent_ns = self._stopped_ns = self._asked_ns = _NEVER_NS
         self._called: dict[int | None, int] = {}  # step -> when, during this arming
@@ -91,7 +94,7 @@ class BridgeCore:
 
     def step(self, inputs: Inputs, now_ns: int) -> Outputs:
         """Take one step's inputs and return the requests and velocity for the robot."""
-        self._requests = []
+        self._requests, self._pressed_here = [], False
         self._watch.note(inputs, now_ns)
         self._note_connection(inputs, now_ns)
         if self._state == "armed" and now_ns > self._good_until_ns:
@@ -153,7 +156,9 @@ class BridgeCore:
         for is_pressed, reason in zip(pressed, _PRESSES, strict=True):
             if is_pressed:
                 self._permit.hold(reason)
-        if any(now and not before for now, before in zip(pressed, self._pressed, strict=True)):
+        new = [now and not before for now, before in zip(pressed, self._pressed, strict=True)]
+        if any(new):
+            self._pressed_here = any(new[:2])
             self._engage(now_ns)
         self._pressed = pressed
         if not stop and any(isinstance(message, Arm) for message in inputs.operator):
@@ -164,7 +169,7 @@ class BridgeCore:
         self._rejected += sum(not isinstance(message, accepted) for message in inputs.operator)
 
     def _engage(self, now_ns: int) -> None:
-        """Handle a new press: end a release, and stop a robot that moves although this bridge has not driven it."""
+        """Handle a new press: end a release, and stop a robot although this bridge does not drive it."""
         if self._released:
             self._released, self._reason = False, self._permit.latch
         if now_ns - self._pressed_ns > _BURST_NS:  # an operator's stop is repeated until it is confirmed
@@ -174,6 +179,11 @@ class BridgeCore:
         if idle and robot is not None and is_driven(robot, self._table):
             self._state, self._ever_armed = "armed", True
             self._stop("estop", self._permit.latch, now_ns)
+        elif self._pressed_here and self._state != "armed" and now_ns - self._press_sent_ns > _BURST_NS:
+            # Whatever the robot reports: it may have been commanded to move before, or drive by itself.
+            self._press_sent_ns = now_ns
+            self._move(_ZERO)
+            self._send_stop(now_ns)
 
     def _take_permission(self, now_ns: int) -> None:
         if not self._permit.is_needed or self._state in ("arming", "armed"):
@@ -305,6 +315,11 @@ class BridgeCore:
             self._state, self._ever_armed = "armed", True  # the previous bridge's state
             self._stop("robot_moving", "the robot was moving when the bridge started; stopped it", now_ns)
 
+    def _may_hold(self, now_ns: int) -> bool:
+        """Return whether a base may still hold the last command of an earlier, killed bridge, though it stands."""
+        first_ns = self._watch.first_report_ns
+        return self._table.holds_command and first_ns is not None and now_ns - first_ns <= _FOUND_MOVING_NS
+
     def _tick(self, now_ns: int) -> None:
         self._next_ns += self._period_ns
         if self._next_ns <= now_ns:  # after a stall: one command now, no burst
@@ -312,7 +327,7 @@ class BridgeCore:
         if self._state == "armed":
             blind = self._watch.fresh(now_ns, self._deadman_ns) is None  # a lost report must not end a run
             self._move(_ZERO if blind else self._slew())
-        elif self._ever_armed and not self._released:  # arming again too: the robot still gets zeros
+        elif (self._ever_armed or self._may_hold(now_ns)) and not self._released:  # arming again too
             self._move(_ZERO)
             again = self._watch.moved_lately(now_ns) and now_ns - self._stop_sent_ns >= _STOP_AGAIN_NS
             if self._state == "stopped" and again:
@@ -333,4 +348,4 @@ class BridgeCore:
 
     def _send_stop(self, now_ns: int) -> None:
         self._stop_sent_ns = now_ns
-        self._requests.append(StopMotion())
+        self._requests.append(StopMotion(self._pressed_here))

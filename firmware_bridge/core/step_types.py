@@ -64,7 +64,13 @@ class Move:
 
 @dataclass(frozen=True)
 class StopMotion:
-    """Request that the robot stops by its own means, without waiting for its answer."""
+    """Request that the robot stops by its own means, without waiting for its answer.
+
+    `pressed`: a person at this computer has pressed the emergency stop. It ends an automatic mode of the robot, too,
+    such as a mission; a person who steers the robot keeps it.
+    """
+
+    pressed: bool = False
 
 
 @dataclass(frozen=True)

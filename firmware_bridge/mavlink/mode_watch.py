@@ -1,7 +1,8 @@
 """Follows a rover's heartbeats: its mode, and mode changes that the bridge did not request. Pure.
 
 A change that the bridge did not request comes from a person (the remote's switch, a ground station) or from a failsafe.
-It always wins: until the next arming the bridge sends no mode command.
+It always wins: the bridge sends no mode command until the next arming, or until a person presses its emergency stop
+while nobody steers the rover.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 from typing import Final
 
 from firmware_bridge.mavlink import modes
+from firmware_bridge.mavlink.commands import RETRY_NS
 from firmware_bridge.mavlink.modes import Autopilot, mode_of, name_of_heartbeat
 
 _ARMED_FLAG: Final = 128  # MAV_MODE_FLAG_SAFETY_ARMED
@@ -37,6 +39,8 @@ class ModeWatch:
         self._status = 0
         self._custom_mode = 0
         self._asked: dict[str, int] = {}  # kind -> when it was last requested
+        self._drive_ns: int | None = None  # when the autopilot accepted the drive mode, until a heartbeat shows it
+        self._arm_ns: int | None = None  # the same of arming
         self._heard_ns = 0
         self._sequence: int | None = None
         self._switched = False
@@ -45,18 +49,26 @@ class ModeWatch:
         """Note that the bridge requests a mode of this kind."""
         self._asked[kind] = now_ns
 
+    def accepted(self, *, arms: bool, now_ns: int) -> None:
+        """Note that the autopilot has accepted to arm, or the drive mode."""
+        if arms:
+            self._arm_ns = now_ns
+        else:
+            self._drive_ns = now_ns
+
     def has_asked(self, kind: str, now_ns: int) -> bool:
         """Return whether a requested mode of this kind may still come."""
         return now_ns - self._asked.get(kind, -_ASKED_NS) < _ASKED_NS
 
-    def begin_arming(self) -> None:
-        """Note that the bridge arms: from now on it may request modes again."""
+    def take_command(self) -> None:
+        """Note that the bridge arms, or that its emergency stop was pressed: it may request modes again."""
         self.yielded = False
 
     def give_way(self) -> None:
         """Note that another station commands the rover: no mode command until the next arming."""
         self.yielded = True
         self._asked.clear()
+        self._drive_ns = self._arm_ns = None
 
     def note_sequence(self, sequence: int) -> bool:
         """Take a packet's sequence number; return whether the packet is newer than every earlier one."""
@@ -73,12 +85,17 @@ class ModeWatch:
         if known and custom_mode != self._custom_mode:
             asked_ns = self._asked.pop(kind, None)
             if asked_ns is None or now_ns - asked_ns > _ASKED_NS:
-                self._switched = self.yielded = True
-                self._asked.clear()
+                self._switched = True
+                self.give_way()
                 # With a failsafe of its own, the autopilot declares a critical state.
                 self.is_taken_over |= self.mode == modes.ARMED_DRIVE and status < _CRITICAL
         self.kind, self._custom_mode = kind, custom_mode
         self.armed = bool(base_mode & _ARMED_FLAG)
+        self._drive_ns = None if kind == modes.DRIVE else self._drive_ns
+        self._arm_ns = None if self.armed else self._arm_ns
+        if any(at_ns is not None and now_ns - at_ns >= RETRY_NS for at_ns in (self._drive_ns, self._arm_ns)):
+            self._switched = True  # back at what it was, before a heartbeat came
+            self.give_way()
         before, self.mode = self.mode, mode_of(kind, self.armed)
         # The bridge never requests this mode; without a latch the next arming would end the mission.
         begins = self.mode == modes.ARMED_OTHER and before != modes.ARMED_OTHER

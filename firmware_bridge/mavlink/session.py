@@ -1,8 +1,8 @@
 """Conversation with one autopilot: received bytes in, a `Report` and packets to send out. Pure: no socket, no clock.
 
 The bridge is a component of its own, an onboard computer (191). It sends a heartbeat twice a second, and setpoints only
-while it arms, drives or keeps the rover stopped. A mode or arming command is sent only for the bridge's rules, never
-after somebody else has changed the mode (`mode_watch.py`).
+while it arms, drives or keeps the rover stopped. A mode or arming command is sent only for the bridge's rules, and not
+after somebody else has changed the mode (`mode_watch.py`), until the next arming or emergency stop at this computer.
 """
 
 from __future__ import annotations
@@ -140,6 +140,8 @@ class Session:
         self.watch.heartbeat(*values, now_ns)
         if first:
             self._request_intervals()
+        self.commands.observe(SET_MODE, self.watch.kind == modes.DRIVE, now_ns)
+        self.commands.observe(ARM_DISARM, self.watch.armed, now_ns)
         if self.watch.yielded:
             self.commands.cancel(SET_MODE, ARM_DISARM)
         elif self._stopped and self.watch.kind == modes.DRIVE:
@@ -166,6 +168,8 @@ class Session:
         if target not in (own, (0, 0)) or foreign is not None:
             return
         waited = self.commands.waits(command)
+        if message.result == ACCEPTED and self.commands.is_careful(command):
+            self.watch.accepted(arms=command == ARM_DISARM, now_ns=now_ns)
         failed = self.commands.acknowledge(command, message.result)
         if command == SET_INTERVAL:
             if not waited or self.commands.waits(SET_INTERVAL) or not self._intervals:
@@ -298,27 +302,35 @@ class Session:
             if self._identifying and self.failsafes.missing:
                 self._tell_once(f"the autopilot does not answer for its parameters {self.failsafes.missing}")
             self._identifying = True
+            self._begin_arming()
             self._stream_until_ns = now_ns + _STREAM_FOR_NS
             self.failsafes.begin()
         elif isinstance(request, Stand):
             self._stream_until_ns = now_ns + _STREAM_FOR_NS
             self._stand(request.step, now_ns)
         else:
+            if request.pressed and not self.watch.in_use():
+                self.watch.take_command()  # it ends a mission, too
             self._stop(now_ns)
 
-    def _stand(self, step: int, now_ns: int) -> None:
+    def _begin_arming(self) -> None:
+        """Note an arming; a rover that is ready gets no step, only the request before the steps."""
         self._stopped = False
         if not self.watch.in_use():
-            self.watch.begin_arming()
+            self.watch.take_command()
+
+    def _stand(self, step: int, now_ns: int) -> None:
+        self._begin_arming()
         if not self.watch.may_command():
             return
         if step == modes.STEP_ARM:
-            self.commands.request(ARM_DISARM, 1.0)
+            self.commands.request(ARM_DISARM, 1.0, careful=True)
         elif step == modes.STEP_DRIVE:
             at_ns = self._stream_since_ns + int(self._autopilot.stream_first_s * 1e9)
             streaming = now_ns - self._setpoint_ns < _PAUSE_NS
             wait_ns = at_ns if streaming else now_ns + int(self._autopilot.stream_first_s * 1e9)
-            self.commands.request(SET_MODE, _CUSTOM_MODE, *map(float, self._autopilot.drive), at_ns=wait_ns)
+            drive = (_CUSTOM_MODE, *map(float, self._autopilot.drive))
+            self.commands.request(SET_MODE, *drive, at_ns=wait_ns, careful=True)
         elif step == modes.STEP_HOLD:
             self._hold()
 

@@ -28,4 +28,5 @@ def robot_table(config: RobotConfig) -> RobotTable:
         recovery_step=0,
         step_names={0: "nothing"},  # never requested: every mode is ready
         mode_names={MODE: "always ready"},
+        holds_command=config.ros2 is not None and not config.ros2.stops_itself,
     )

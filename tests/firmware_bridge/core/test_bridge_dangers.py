@@ -59,7 +59,8 @@ DANGERS = [
     (lambda bench: bench.step(denied="StopMove"), "second_commander"),
     (lambda bench: bench.step(publishers="2 publishers of rt/sportmodestate"), "second_publisher"),
 ]
-LATCHING = (_remote_estop, _local_estop, _operator)
+PRESSES = (_local_estop, _operator)  # at this computer
+LATCHING = (_remote_estop, *PRESSES)
 
 
 @pytest.mark.parametrize(("danger", "cause"), DANGERS)
@@ -69,10 +70,10 @@ class TestEveryDanger:
         bench.drive(500)
         bench.written.clear()
         danger(bench)
-        assert bench.written == [(bench.now_ns, ZERO), (bench.now_ns, STOP_MOVE)]
+        assert bench.written == [(bench.now_ns, ZERO), (bench.now_ns, StopMotion(pressed=danger in PRESSES))]
         assert (bench.status.state, bench.status.cause) == ("stopped", cause)
 
-    def test_it_refuses_to_arm_and_sends_nothing(self, danger, cause: str) -> None:
+    def test_it_refuses_to_arm_and_sends_nothing_but_a_press(self, danger, cause: str) -> None:
         bench = Bench()
         danger(bench)
         assert bench.status.blocked_by == cause
@@ -81,7 +82,8 @@ class TestEveryDanger:
         latched = danger in LATCHING
         assert (bench.status.state, bench.status.cause) == ("disarmed", "operator" if latched else cause)
         assert bench.status.reason.startswith("arm refused: ")
-        assert bench.written == []
+        sent = [ZERO, StopMotion(pressed=True)] if danger in PRESSES else []
+        assert [request for _, request in bench.written] == sent
 
     def test_a_command_in_the_same_step_does_not_pass(self, danger, cause: str) -> None:
         bench = Bench().arm()

@@ -57,6 +57,7 @@ class TestOperator:
     def test_taking_it_back_does_not_arm(self) -> None:
         bench = Bench()
         _operator(bench)
+        bench.written.clear()
         bench.permit()
         bench.wait(1000)
         assert bench.status.state == "disarmed" and bench.written == []
@@ -298,7 +299,7 @@ class TestConfirmation:
         bench.wait(2000)
         bench.robot = {"vx_mps": 0.5}
         _operator(bench)
-        assert [request for _, request in bench.written] == [ZERO, StopMotion()]
+        assert [request for _, request in bench.written] == [ZERO, StopMotion(pressed=True)]
 
 
 class TestRelease:
@@ -347,7 +348,7 @@ class TestPressOutsideADrive:
         bench.step()
         bench.written.clear()
         press(bench)
-        assert [request for _, request in bench.written] == [ZERO, StopMotion()]
+        assert [request for _, request in bench.written] == [ZERO, StopMotion(pressed=press is not _remote_estop)]
 
     @pytest.mark.parametrize("press", [_operator, _remote_estop, _local_estop])
     @pytest.mark.parametrize("state", [_disarmed, _released])

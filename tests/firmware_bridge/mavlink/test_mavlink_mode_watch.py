@@ -129,7 +129,7 @@ def test_after_a_pilots_switch_only_an_arming_permits_mode_commands(later: list[
     for second, mode in enumerate(later):
         beat(watch, mode, (3 + second) * S)
         assert not watch.may_command()
-    watch.begin_arming()
+    watch.take_command()
     assert watch.may_command() is (watch.kind != modes.PILOT)
 
 

@@ -344,7 +344,9 @@ class World:
             assert moves, "the zeros have ended"
         assert status.state != "armed" or now_ns <= rules.gate.good_until_ns, "the deadman has not stopped the robot"
         assert status.state == "armed" or self._last_move == ZERO, "the last velocity of a stopped robot is not zero"
-        if moves:
+        # A press sends one zero to a robot that the bridge has neither driven nor found moving: no stream of them.
+        streams = "armed" in (before, status.state) or (before, status.state) == ("disarmed", "stopped")
+        if moves and (self._last_move_ns is not None or streams):
             self._last_move_ns = now_ns
 
     def _end_release(self) -> None:
