@@ -24,6 +24,7 @@ from firmware_bridge.core.step_types import Report
 _LEAST_MISSING_NS: Final = 200_000_000
 """Time below which no message counts as missing: shorter than the deadman, longer than a busy computer's pauses."""
 _COMMANDED_NS: Final = 200_000_000  # a command older than this is not compared with the wheels
+_CYCLE_TOLERANCE: Final = 50  # our choice: a cycle differs from that of the DBC file by at most 1/50
 _CLOCK_STEP_NS: Final = 100_000_000  # our choice: the base's clock and the counted cycles may differ by this
 _STATE_PLACES: Final = ("can.odometry.", "can.wheels.", "can.state.")
 
@@ -69,11 +70,13 @@ class _BaseClock:
     """The base's time of each odometry sample, from its counter and, where there is one, its clock signal.
 
     `is_known` is False until a base with a clock signal has sent it: a stamp counted before would be of another clock.
+    Without that signal the count follows the arrivals slowly: the base's cycle is only about that of the DBC file.
     """
 
     def __init__(self, cycle_ns: int, period: int, *, is_known: bool) -> None:
         self._cycle_ns, self._period = cycle_ns, period
-        self.is_known = is_known
+        self.is_known, self._is_counted = is_known, is_known
+        self._offset_ns = 0  # of our clock to the base's, at the first sample
         self._counter: int | None = None
         self._received_ns = 0
         self.stamp_ns = cycle_ns
@@ -87,6 +90,11 @@ class _BaseClock:
         if clear and not first and counter is not None and last is not None:
             passed_ns = (counter - last) % self._period * self._cycle_ns
         self.stamp_ns += passed_ns
+        if first:
+            self._offset_ns = now_ns - self.stamp_ns
+        elif self._is_counted:
+            most_ns = passed_ns // _CYCLE_TOLERANCE
+            self.stamp_ns += min(max(now_ns - self._offset_ns - self.stamp_ns, -most_ns), most_ns)
         return passed_ns
 
     def set(self, uptime_ns: int) -> None:
@@ -260,7 +268,7 @@ class BaseReader:
             position_z_m=0.0,
             roll_rad=roll or 0.0,
             pitch_rad=pitch or 0.0,
-            gyro_wz_radps=wz if gyro is None else gyro,
+            gyro_wz_radps=gyro,
             foot_forces=(0, 0, 0, 0),
         )
 

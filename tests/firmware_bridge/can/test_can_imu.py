@@ -39,12 +39,14 @@ def base_with_tilt(folder: Path, range_: str = RANGE) -> tuple[CanConfig, CanDat
     return config.can, load_database(config)
 
 
-def reports(can: CanConfig, database: CanDatabase, rolls_deg: Iterable[float | None]) -> list[Report]:
-    """Reports of a standing base, one each 10 ms, with these rolls; None: no message of it."""
+def reports(
+    can: CanConfig, database: CanDatabase, rolls_deg: Iterable[float | None], cycle_ns: int = 10 * MS
+) -> list[Report]:
+    """Reports of a standing base, one each `cycle_ns`, with these rolls; None: no message of it."""
     messages = {message.name: message for message in database.received.values()}
     reader, found = BaseReader(can, database, 0, (0,)), []
     for cycle, roll_deg in enumerate(rolls_deg):
-        now_ns = cycle * 10 * MS
+        now_ns = cycle * cycle_ns
         sent = {"WheelSpeed": bytes(4), "Gyro": bytes(2), "DriveStatus": bytes((0x40, 0, 3, 0))}
         if roll_deg is not None:
             sent["Tilt"] = round(roll_deg * 100).to_bytes(2, "big", signed=True)
@@ -92,3 +94,17 @@ def test_a_base_without_an_imu_needs_none(tmp_path: Path) -> None:
     can = replace(config.can, imu=None)
     last = reports(can, load_database(replace(config, can=can)), [None] * 20)[-1]
     assert last.state is not None and last.unsafe is None
+    assert last.state.gyro_wz_radps is None, "wheels are no gyroscope"
+
+
+@pytest.mark.parametrize("share", [0.982, 1.018])
+def test_a_base_whose_cycle_is_not_quite_that_of_the_dbc_file_is_neither_early_nor_late(share: float) -> None:
+    """For 80 s: a count of the file's cycle would be 1.4 s off at the end."""
+    config, cycle_ns = load_robot_config(EXAMPLE), round(share * 10 * MS)
+    assert config.can is not None
+    can = replace(config.can, imu=None)
+    found = reports(can, load_database(replace(config, can=can)), [None] * 8000, cycle_ns)
+    ages_ns = [
+        cycle * cycle_ns - report.state.robot_stamp_ns for cycle, report in enumerate(found) if report.state is not None
+    ]
+    assert len(ages_ns) > 7900 and max(ages_ns) - min(ages_ns) < 50 * MS

@@ -147,6 +147,50 @@ class TestOrder:
         assert order.accept(state(0, received_ns=S + 2))
 
 
+class TestDelay:
+    """A late report shows where the robot was: it must not pass for where it is."""
+
+    @staticmethod
+    def accepted(delays_s: list[float]) -> list[bool]:
+        """Whether reports are accepted that come every 20 ms, made in order, each so much late."""
+        order = StampOrder()
+        stamps = [100.0 + k * 0.02 - delay for k, delay in enumerate(delays_s)]
+        return [
+            order.accept(replace(state(0), robot_stamp_ns=round(stamp * S), received_ns=round((10 + k * 0.02) * S)))
+            for k, stamp in enumerate(stamps)
+        ]
+
+    def test_a_delay_that_grows_beyond_half_a_second_is_never_believed(self) -> None:
+        growing = [min(5.0, 0.01 * k) for k in range(1000)]
+        found = self.accepted(growing)
+        assert all(found[:50]) and not any(found[53:])
+
+    def test_after_a_delay_the_timely_reports_are_believed_at_once(self) -> None:
+        found = self.accepted([0.0] * 10 + [0.01 * k for k in range(100)] + [0.0] * 10)
+        assert all(found[-10:])
+
+    def test_a_clock_that_is_set_back_is_believed_after_a_second(self) -> None:
+        found = self.accepted([0.0] * 10 + [0.8] * 100)
+        assert not any(found[10:60]) and all(found[61:])
+
+    def test_a_robot_that_is_switched_on_again_without_a_battery_for_its_clock_is_believed(self) -> None:
+        order = StampOrder()
+        assert order.accept(state(100 * S, received_ns=10 * S))
+        assert order.accept(state(102 * S, received_ns=40 * S))
+        assert order.accept(state(102 * S + 1, received_ns=40 * S + 1))
+
+    def test_a_silence_of_five_seconds_is_no_new_start(self) -> None:
+        order = StampOrder()
+        assert order.accept(state(100 * S, received_ns=10 * S))
+        assert not order.accept(state(102 * S, received_ns=15 * S)) and order.dropped == 1
+        assert not order.accept(state(102 * S + 1, received_ns=15 * S + 1))
+
+    def test_a_robot_that_begins_to_fill_in_stamps_late_is_believed(self) -> None:
+        order = StampOrder()
+        assert all(order.accept(state(0, received_ns=k * S)) for k in range(1, 100))
+        assert all(order.accept(state(k * S, received_ns=(k + 99) * S)) for k in range(1, 4))
+
+
 class TestClock:
     """How far ahead of ours a robot's clock may be: 500 ms more than it was, and 1 ms a second of drift."""
 
