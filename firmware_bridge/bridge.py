@@ -44,6 +44,7 @@ _OPERATORS: Final = 4  # at a time
 _OBSERVERS: Final = 4
 _LOG_TIMEOUT_S: Final = 0.5
 _JOIN_AGAIN_NS: Final = 1_000_000_000
+_LOOK_AGAIN_NS: Final = 1_000_000_000
 _LAST_ZEROS: Final = 5  # ticks of zeros between a signal and the exit
 _LATE_NS: Final = 50_000_000  # a step this late is no sign of life for the watchdog
 _PAUSE_NS: Final = 1_000_000
@@ -66,10 +67,10 @@ stop, arm, release and status look for a bridge at the installed service's socke
 member of tic-vla-operators) and at the robot file's, or at --socket only. With a robot file that cannot be used, stop
 looks at the usual places.
 exit codes: 0 ended by a signal or the terminal's end, robot stopped (stop, arm, release, status: done); 1 internal
-failure, robot stopped (stop: the robot has not reported that it stands still, or another bridge has died or cannot be
-reached; use the remote); 2 bad arguments or robot file; 3 refused: another bridge owns the socket (stop, arm,
-release, status: no bridge is running, or none that this user may reach; arm: no runner waits, or more than one
-bridge); 130 interrupted (stop, arm, release, status)"""
+failure or removed sockets, robot stopped (stop: the robot has not reported that it stands still, or another bridge
+has died or cannot be reached; use the remote); 2 bad arguments or robot file; 3 refused: another bridge owns the
+socket (stop, arm, release, status: no bridge is running, or none that this user may reach; arm: no runner waits, or
+more than one bridge); 130 interrupted (stop, arm, release, status)"""
 
 
 class Bridge:
@@ -111,6 +112,8 @@ class Bridge:
         )
         self._period_ns = 1_000_000_000 // config.bridge.rate_hz
         self._wake_ns = self._pinged_ns = time.monotonic_ns()
+        self.failed: str | None = None
+        self._looked_ns = 0  # when the sockets' files were last looked for
         self._reported, self._ready, self._extended_ns = "", False, -_EXTEND_NS
 
     @property
@@ -124,7 +127,7 @@ class Bridge:
         """Serve until a byte arrives on `wakeup`; leave with the robot stopped, whatever happens."""
         try:
             outputs = self._step()
-            while not self._wait(wakeup, outputs.wake_ns):
+            while not self._wait(wakeup, outputs.wake_ns) and not self._is_cut_off():
                 outputs = self._step()
             self._notifier.stopping("stopping the robot")
             self._step(shutdown=True)
@@ -161,6 +164,18 @@ class Bridge:
         left_ns = wake_ns - time.monotonic_ns()
         ready = poller.poll(max(-(-left_ns // 1_000_000), 0))
         return any(fd == wakeup.fileno() for fd, _ in ready)
+
+    def _is_cut_off(self) -> bool:
+        """Whether an operator could not reach this bridge any more, as after its user's log-out: then it must end."""
+        now_ns = time.monotonic_ns()
+        if now_ns - self._looked_ns < _LOOK_AGAIN_NS:
+            return False
+        self._looked_ns = now_ns
+        if self._operators.is_removed or self._link.is_removed:
+            folder = self._config.bridge.socket.parent
+            self.failed = f"the sockets in {folder} were removed, so no stop could reach this bridge; start it again"
+            self._log.write(self.failed)
+        return self.failed is not None
 
     def _join_robot(self) -> bool:
         """Open the robot's link as soon as it is there; whether that has happened in this call."""
@@ -294,7 +309,7 @@ def serve(config: RobotConfig, latch_path: Path, groups: SocketGroups) -> dict[s
             bridge.run(wakeup)
         finally:
             log.close(_LOG_TIMEOUT_S)
-        return bridge.result()
+        return {**bridge.result(), **({} if bridge.failed is None else {"error": bridge.failed})}
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -336,7 +351,8 @@ def main(argv: list[str] | None = None) -> int:
             if args.latch is not None:
                 check_latch_path(args.latch)
             latch = Path(f"{config.bridge.socket}.latch") if args.latch is None else args.latch
-            code, result = 0, serve(config, latch, SocketGroups(args.runner_group, args.operator_group))
+            result = serve(config, latch, SocketGroups(args.runner_group, args.operator_group))
+            code = int("error" in result)
         else:
             from firmware_bridge.operate import operate, sockets_of  # never part of the process that serves
 

@@ -131,6 +131,14 @@ def check_is_ours(folder: Path, option: str = "--socket") -> None:
         raise ConfigError(f"{folder}: {what}; remove it or give another {option}")
 
 
+def _identity(path: Path) -> tuple[int, int] | None:
+    try:
+        found = path.lstat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
+
+
 class ClientLink:
     """One listening socket with one client at a time, or a few."""
 
@@ -143,10 +151,16 @@ class ClientLink:
         self._path = path
         self._places = places
         self._listener = listen(path, group)
+        self._file = _identity(path)
         self._refusing = False
         self._clients: list[socket.socket] = []
         self._sent_ns = 0
         self._sent: tuple[str, ...] = ()
+
+    @property
+    def is_removed(self) -> bool:
+        """Whether the socket's file is gone or another one has its place: no new client can connect."""
+        return _identity(self._path) != self._file
 
     @property
     def connected(self) -> bool:
@@ -192,7 +206,8 @@ class ClientLink:
         """Disconnect the clients and remove the socket file."""
         for file in (self._listener, *self._clients):
             file.close()
-        self._path.unlink(missing_ok=True)
+        if not self.is_removed:
+            self._path.unlink(missing_ok=True)
 
     def _accept(self) -> None:
         self._refusing = False

@@ -7,6 +7,7 @@ operator can block an emergency stop. Only the robot's own speed confirms a stop
 from __future__ import annotations
 
 import functools
+import os
 import sys
 import time
 from collections.abc import Callable
@@ -22,7 +23,7 @@ from firmware_bridge.core.config import (
     SERVICE_SOCKET,
     ConfigError,
     load_robot_config,
-    runtime_dir,
+    runtime_dirs,
 )
 from firmware_bridge.core.link import BridgeStatus, Stop
 from firmware_bridge.system.terminal import one_line
@@ -56,6 +57,7 @@ def _write(text: str) -> None:
 def sockets_of(command: str, robot: str, socket: Path | None, say: Say = _write) -> tuple[Path, ...]:
     """Return the sockets at which `command` looks for a bridge: `socket` alone, or the service's and the robot file's.
 
+    Where the robot file names no folder, also those that exist where another kind of shell of this user has them.
     Raises ConfigError for a robot file that cannot be used; a stop is sent to the usual places then.
     """
     try:
@@ -64,8 +66,12 @@ def sockets_of(command: str, robot: str, socket: Path | None, say: Say = _write)
         if command != "stop":
             raise
         say(one_line(error))
-        own = socket or runtime_dir() / ROBOT_FILE_SOCKET
-    return (own,) if socket else (SERVICE_SOCKET, own)
+        own = socket or runtime_dirs()[0] / ROBOT_FILE_SOCKET
+    if socket:
+        return (own,)
+    usual, *others = runtime_dirs()
+    found = [place / own.name for place in others if own.parent == usual and os.path.lexists(place / own.name)]
+    return (SERVICE_SOCKET, own, *found)
 
 
 def operate(command: str, *sockets: Path, say: Say = _write) -> tuple[int, dict[str, object]]:

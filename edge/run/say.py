@@ -22,7 +22,7 @@ from edge.core.cli import (
     messages,
 )
 from edge.run.stop_phrase import is_stop_phrase
-from firmware_bridge.core.config import OPERATOR_SUFFIX, ROBOT_FILE_SOCKET, SERVICE_SOCKET, runtime_dir
+from firmware_bridge.core.config import OPERATOR_SUFFIX, ROBOT_FILE_SOCKET, SERVICE_SOCKET, runtime_dirs
 from firmware_bridge.system.terminal import CommandParser
 
 ANSWER_S = 2.0
@@ -76,7 +76,7 @@ def stop_robot(path: Path, bridge: Path | None = None) -> int:
     """
     from firmware_bridge.operate import operate
 
-    defaults = (SERVICE_SOCKET, runtime_dir() / ROBOT_FILE_SOCKET)
+    defaults = (SERVICE_SOCKET, *(folder / ROBOT_FILE_SOCKET for folder in runtime_dirs()))
     bridges = [bridge] if bridge else [each for each in defaults if not _is_absent(each)]
     with contextlib.ExitStack() as stack:
         try:

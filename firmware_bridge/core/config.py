@@ -28,6 +28,7 @@ from firmware_bridge.core.sections import (
     SafetyConfig,
     require,
     runtime_dir,
+    runtime_dirs,
     speed_hint,
 )
 from firmware_bridge.system.input_file import read_toml
@@ -52,6 +53,7 @@ __all__ = [
     "SafetyConfig",
     "load_robot_config",
     "runtime_dir",
+    "runtime_dirs",
 ]
 
 LINKS: Final[dict[str, tuple[str, ...]]] = {

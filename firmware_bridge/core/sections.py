@@ -33,6 +33,8 @@ _ADDRESSES: Final = {
     "ros2raw": _TOPIC,
 }
 """What follows that colon."""
+RUN_USER: Final = Path("/run/user")  # of systemd's login manager
+TMP: Final = Path("/tmp")
 MAX_SOCKET_PATH_BYTES: Final = 107  # sizeof(sockaddr_un.sun_path) less its NUL, unix(7)
 
 
@@ -73,7 +75,17 @@ class Section:
 def runtime_dir() -> Path:
     """Return the directory of this user's sockets: `$XDG_RUNTIME_DIR/tic-vla-edge`, else one in /tmp by user id."""
     base = os.environ.get("XDG_RUNTIME_DIR", "")
-    return Path(base) / "tic-vla-edge" if base else Path("/tmp") / f"tic-vla-edge-{os.getuid()}"
+    return Path(base) / "tic-vla-edge" if base else TMP / f"tic-vla-edge-{os.getuid()}"
+
+
+def runtime_dirs() -> tuple[Path, ...]:
+    """Return the directories in which a bridge that this user has started by hand may listen, `runtime_dir()` first.
+
+    A shell of `su` or cron has no XDG_RUNTIME_DIR, so that the same user's bridge listens elsewhere.
+    """
+    user = os.getuid()
+    others = (RUN_USER / str(user) / "tic-vla-edge", TMP / f"tic-vla-edge-{user}")
+    return tuple(dict.fromkeys((runtime_dir(), *others)))
 
 
 @dataclass(frozen=True)

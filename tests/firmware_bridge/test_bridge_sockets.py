@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import io
+import os
 import socket
 import threading
 import time
@@ -14,13 +16,18 @@ from pathlib import Path
 import pytest
 
 from edge.deploy import units
+from firmware_bridge import bridge as bridge_module
 from firmware_bridge import operate as operate_module
 from firmware_bridge import peer as peer_module
+from firmware_bridge.bridge import Bridge
 from firmware_bridge.bridge import main as bridge_main
 from firmware_bridge.client_link import ClientLink
-from firmware_bridge.core.config import OPERATOR_SUFFIX, SERVICE_SOCKET
+from firmware_bridge.core import sections
+from firmware_bridge.core.config import OPERATOR_SUFFIX, SERVICE_SOCKET, load_robot_config
 from firmware_bridge.core.link import Arm, BridgeStatus, Message, Stop
 from firmware_bridge.operate import operate
+from firmware_bridge.system.line_log import LineLog
+from firmware_bridge.system.notify import Notifier
 from tests.support.processes import GO2_SIM
 
 
@@ -163,8 +170,62 @@ class TestCommandLine:
         own = tmp_path / "tic-vla-edge" / "bridge.sock"
         assert asked == [(command, SERVICE_SOCKET, own) for command in ("stop", "arm", "status")]
 
+    @pytest.mark.parametrize("has_session", [True, False], ids=["in a session", "of su or cron"])
+    def test_a_bridge_of_the_same_users_other_kind_of_shell_is_found(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_session: bool
+    ) -> None:
+        user, temporary = tmp_path / "run" / str(os.getuid()), tmp_path / "tmp"
+        places = [user / "tic-vla-edge", temporary / f"tic-vla-edge-{os.getuid()}"]
+        monkeypatch.setattr(sections, "RUN_USER", user.parent)
+        monkeypatch.setattr(sections, "TMP", temporary)
+        if has_session:
+            monkeypatch.setenv("XDG_RUNTIME_DIR", str(user))
+        else:
+            monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+            places.reverse()
+        here, elsewhere = (place / "bridge.sock" for place in places)
+        assert operate_module.sockets_of("stop", str(GO2_SIM), None) == (SERVICE_SOCKET, here)
+        elsewhere.parent.mkdir(parents=True)
+        elsewhere.touch()
+        assert operate_module.sockets_of("stop", str(GO2_SIM), None) == (SERVICE_SOCKET, here, elsewhere)
+
     def test_a_socket_that_is_given_is_the_only_one(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         asked: list[tuple[str, ...]] = []
         monkeypatch.setattr(operate_module, "operate", lambda *given: asked.append(given) or (0, {}))
         bridge_main(["stop", "--robot", str(GO2_SIM), "--socket", str(path)])
         assert asked == [("stop", path)]
+
+
+class TestRemoved:
+    """A bridge that no operator can reach any more, as when a log-out has removed its folder."""
+
+    @pytest.fixture
+    def bridge(self, path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bridge]:
+        monkeypatch.setattr(bridge_module, "_LOOK_AGAIN_NS", 0)
+        monkeypatch.setattr(bridge_module, "missing_link", lambda _: "no cable")
+        log = LineLog(io.StringIO(), "edge-bridge")
+        yield Bridge(load_robot_config(GO2_SIM, socket=path), log, Notifier({}), tmp_path / "latch")
+        log.close(1.0)
+
+    @pytest.mark.parametrize("suffix", ["", OPERATOR_SUFFIX], ids=["the runner's", "the operators'"])
+    @pytest.mark.parametrize("replaced", [True, False], ids=["replaced", "removed"])
+    def test_it_ends_and_says_why(self, bridge: Bridge, path: Path, suffix: str, replaced: bool) -> None:
+        file = Path(f"{path}{suffix}")
+        file.rename(f"{file}.old")
+        if replaced:
+            file.touch()
+        wakeup, other = socket.socketpair()
+        with wakeup, other:
+            bridge.run(wakeup)
+        assert bridge.failed is not None and "no stop could reach this bridge" in bridge.failed
+        assert file.exists() is replaced, "a file of another bridge stays"
+
+    def test_with_its_sockets_in_place_it_runs_until_a_signal(self, bridge: Bridge, path: Path) -> None:
+        wakeup, other = socket.socketpair()
+        with wakeup, other, ThreadPoolExecutor(1) as pool:
+            running = pool.submit(bridge.run, wakeup)
+            time.sleep(0.3)
+            assert not running.done()
+            other.send(b"x")
+            running.result(5.0)
+        assert bridge.failed is None and not path.exists()
