@@ -166,6 +166,8 @@ def bridge_unit(inputs: ServiceInputs) -> str:
         ("SystemCallFilter", "~@privileged @resources"),
         "For the groups of its sockets; no PrivateUsers, in which those groups do not exist.",
         ("SystemCallFilter", "chown fchownat"),
+        "For the threads of its robot's link, which get less than its own priority.",
+        ("SystemCallFilter", "sched_setscheduler"),
     ]
     unit: list[Setting | str] = [
         ("Description", "tic-vla-edge bridge: the only process that commands the robot"),
