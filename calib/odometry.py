@@ -227,7 +227,9 @@ def fit(drive: Drive, references: Sequence[Reference], prior: OdometryCalibratio
     """Fit scales and drift to the references. Raises LogError when none can be compared, or NoFitError."""
     bias, bias_sigma = gyro_bias(drive, prior)
     has_gyro = drive.reports[0].gyro_wz_radps is not None
-    model = OdometryModel(has_gyro, bias if has_gyro else 0.0, 0.0, 0.0, 1.0, 1.0, GYRO_NOISE_RADPS_RTHZ, 0.05, 0.05)
+    model = OdometryModel(
+        has_gyro, bias if has_gyro else 0.0, 0.0, 0.0, 1.0, 1.0, GYRO_NOISE_RADPS_RTHZ, 0.05, 0.05, 0.05
+    )
     begin_ns, accepted = increments(drive)
     pairs = [(interval, reference) for reference, interval in _intervals(begin_ns, accepted, references, model)]
     if not pairs:

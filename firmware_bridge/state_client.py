@@ -117,5 +117,5 @@ class StateReader:
 
 def is_possible(state: RobotState) -> bool:
     """Whether every number of a state is finite and of a plausible size, whatever the protocol."""
-    speeds = (state.vx_mps, state.vy_mps, state.wz_radps, state.gyro_wz_radps)
+    speeds = (state.vx_mps, state.vy_mps, state.wz_radps, state.gyro_wz_radps or 0.0)
     return within(_LARGEST, *state.T_odom_base, state.position_z_m, *speeds, state.roll_rad, state.pitch_rad)

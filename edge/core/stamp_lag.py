@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Final
 
-CLOCK_DRIFT: Final = 100e-6
-"""Largest rate difference between the sender's clock and ours; more counts as a delay."""
+CLOCK_DRIFT: Final = 500e-6
+"""Largest rate difference between the sender's clock and ours, as while ntpd corrects one; more counts as a delay."""
 CLOCK_BACK_NS: Final = 100_000_000
 CLOCK_STEP_NS: Final = 5_000_000_000
 """The sender's clock was set when its stamps go back by more than the first, or the offset between its clock and ours

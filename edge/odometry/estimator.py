@@ -97,9 +97,11 @@ class DriftEstimator:
             gyro_noise_radps_rthz=GYRO_NOISE_RADPS_RTHZ,
             rate_m_per_m=known.drift_m_per_m,
             rate_rad_per_m=known.drift_rad_per_m,
+            rate_rad_per_rtrad=known.scale_yaw_sigma,
         )
         self._visual_scale = 0.0
         self._covariance = np.zeros((4, 4))
+        self._walked_ns = 0  # until when the covariance contains the gyro bias's walk
         self._drift, self._residual = DriftMonitor(), DriftMonitor()
         self._still = StillCheck()
         self.visual_used = 0
@@ -163,6 +165,7 @@ class DriftEstimator:
         self._model = replace(self._model, has_gyro=has_gyro, heading=known.gyro_bias_radps if has_gyro else 0.0)
         sigmas = (heading_sigma, known.scale_x_sigma, known.sideways_sigma, VISUAL_SCALE_SIGMA)
         self._covariance = np.diag(np.square(sigmas))
+        self._walked_ns = report.received_ns
         node = pose_chain.origin(report.received_ns, report.T_odom_base, self._covariance)
         self._commit = self._live = Cursor(node, 0.0)
         self._published = ([node], node)
@@ -186,9 +189,18 @@ class DriftEstimator:
         if measured is None or not self._model.has_gyro:
             return
         rate_radps, seconds = measured
-        row = self._covariance[HEADING]
+        assert self._live is not None and self._commit is not None
+        now_ns = self._live.node.stamp_ns
+        # Without it the bias would become an average of all the time at rest: it changes as the sensor warms up.
+        walked = self._covariance.copy()  # the nodes keep the old one
+        walked[HEADING, HEADING] += GYRO_BIAS_WALK_RADPS_RTS**2 * max(now_ns - self._walked_ns, 0) / 1e9
+        self._walked_ns = max(now_ns, self._walked_ns)
+        row = walked[HEADING]
         gain = row / (row[HEADING] + GYRO_NOISE_RADPS_RTHZ**2 / seconds)
-        self._learn(gain * (rate_radps - self._model.heading), self._covariance - np.outer(gain, row))
+        self._learn(gain * (rate_radps - self._model.heading), walked - np.outer(gain, row))
+        self._live, self._commit = (
+            each._replace(node=each.node._replace(parameters=self._covariance)) for each in (self._live, self._commit)
+        )
 
     def _learn(self, change: Array, covariance: Array) -> None:
         """Correct the parameters."""
@@ -282,7 +294,8 @@ class DriftEstimator:
         return np.diag(2 * self._stamp_sigma_s**2 * mean_squares)
 
     def _walk(self, interval: Interval, seen: VisualMotion) -> Array:
-        seconds = (seen.end_ns - seen.start_ns) / 1e9
+        seconds = max(seen.end_ns - max(seen.start_ns, self._walked_ns), 0) / 1e9
+        self._walked_ns = max(seen.end_ns, self._walked_ns)
         scale = SCALE_WALK_RTM**2 * interval.distance_m
         heading = GYRO_BIAS_WALK_RADPS_RTS**2 * seconds if self._model.has_gyro else scale
         return np.diag((heading, scale, scale, 0.0))

@@ -41,6 +41,10 @@ STILL_NS = 300_000_000
 STILL_MPS = 0.05
 STILL_RADPS = math.radians(4.0)
 STILL_M = 0.01
+STILL_HEADING_RAD = 0.005
+STILL_HEADING_RADPS = math.radians(0.5)
+"""How far the reported heading of a standing robot may be from one that follows it this slowly: its own drift. A robot
+that is turned by hand changes it faster, and its turn must not be learned as a gyro bias."""
 COMMAND_MPS = 0.02
 FOOT_SHARE = 0.2
 """Share of the mean foot force from which a foot carries load."""
@@ -275,26 +279,32 @@ def _moved(before: OdometryInputs, after: OdometryInputs) -> tuple[float, float,
 
 
 class StillCheck:
-    """Detects standstill: speed, turn, position, command and feet must agree for a while."""
+    """Detects standstill: speed, turn, pose, command and feet must agree for a while."""
 
     def __init__(self) -> None:
         self._since_ns: int | None = None
         self._at = (0.0, 0.0)
+        self._heading_rad = 0.0  # follows the reported one
         self._turned_rad = 0.0
         self._seconds = 0.0
 
     def step(self, report: OdometryInputs, increment: Increment, gyro_bias_radps: float) -> bool:
         """Return whether the robot stands, by this report and the earlier ones."""
-        x, y, _ = report.T_odom_base
-        if self._since_ns is not None:
-            quiet = self._quiet(report, gyro_bias_radps) and math.dist(self._at, (x, y)) <= STILL_M
-            if quiet:
-                self._turned_rad += increment.turn_rad
-                self._seconds += increment.dt_s
-                return report.received_ns - self._since_ns >= STILL_NS
-        self._since_ns = report.received_ns if self._quiet(report, gyro_bias_radps) else None
-        self._at, self._turned_rad, self._seconds = (x, y), 0.0, 0.0
+        quiet = self._quiet(report, gyro_bias_radps)
+        if quiet and self._since_ns is not None and self._stays(report, increment.dt_s):
+            self._turned_rad += increment.turn_rad
+            self._seconds += increment.dt_s
+            return report.received_ns - self._since_ns >= STILL_NS
+        self._since_ns = report.received_ns if quiet else None
+        *place, self._heading_rad = report.T_odom_base
+        self._at, self._turned_rad, self._seconds = (place[0], place[1]), 0.0, 0.0
         return False
+
+    def _stays(self, report: OdometryInputs, dt_s: float) -> bool:
+        x, y, theta = report.T_odom_base
+        turned, most = wrap_angle(theta - self._heading_rad), STILL_HEADING_RADPS * dt_s
+        self._heading_rad += min(max(turned, -most), most)
+        return math.dist(self._at, (x, y)) <= STILL_M and abs(turned) <= STILL_HEADING_RAD
 
     def take_rate(self) -> tuple[float, float] | None:
         """Return mean yaw rate at rest (rad/s) and duration (s) once it is long enough. Each mean is returned once."""

@@ -150,6 +150,8 @@ class OdometryModel:
     gyro_noise_radps_rthz: float
     rate_m_per_m: float
     rate_rad_per_m: float
+    rate_rad_per_rtrad: float
+    """Error of the odometry's turn per square root of the turn: without a gyro."""
 
     def corrected(self, increment: Increment) -> tuple[float, float, float, float]:
         """Return corrected forward m, left m and turn rad, and the turn's derivative by `heading`."""
@@ -201,7 +203,7 @@ def advance(cursor: Cursor, increment: Increment, model: OdometryModel) -> Curso
     elif model.has_gyro:
         variance_rad2 = model.gyro_noise_radps_rthz**2 * increment.dt_s
     else:
-        variance_rad2 = model.rate_rad_per_m**2 * share
+        variance_rad2 = model.rate_rad_per_m**2 * share + model.rate_rad_per_rtrad**2 * abs(turn)
     node = extend(
         cursor.node, increment.end_ns, forward, left, turn, model.rate_m_per_m**2 * share, variance_rad2, gain
     )
@@ -210,14 +212,14 @@ def advance(cursor: Cursor, increment: Increment, model: OdometryModel) -> Curso
 
 def integrate(increments: list[Increment], model: OdometryModel) -> Interval:
     """Sum increments and their derivatives by the parameters."""
-    x = y = theta = turned = distance = plain_x = plain_y = odometry = seconds = 0.0
+    x = y = theta = turned = turns = distance = plain_x = plain_y = odometry = seconds = 0.0
     gains = np.zeros((3, PARAMETERS))
     still = True
     for increment in increments:
         forward, left, turn, gain = model.corrected(increment)
         c, s = math.cos(theta + 0.5 * turn), math.sin(theta + 0.5 * turn)
         dx, dy = c * forward - s * left, s * forward + c * left
-        x, y, theta = x + dx, y + dy, theta + turn
+        x, y, theta, turns = x + dx, y + dy, theta + turn, turns + abs(turn)
         if not increment.still:
             still = False
             plain_x += c * increment.dx_m - s * increment.dy_m
@@ -234,7 +236,7 @@ def integrate(increments: list[Increment], model: OdometryModel) -> Interval:
     if model.has_gyro:
         variance_rad2 = model.gyro_noise_radps_rthz**2 * seconds + 1e-10
     else:
-        variance_rad2 = model.rate_rad_per_m**2 * grown(distance) + 1e-10
+        variance_rad2 = model.rate_rad_per_m**2 * grown(distance) + model.rate_rad_per_rtrad**2 * turns + 1e-10
     return Interval(
         motion=np.array((x, y, theta)),
         uncorrected=np.array((plain_x, plain_y)),

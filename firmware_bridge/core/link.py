@@ -9,11 +9,13 @@ Little-endian. Header: magic `TVEB`, version u8, kind u8, payload length u16.
   5 release   empty; operator's socket only
   6 state     the robot's newest report (`RobotState`); observers' socket only
   7 battery   its battery; observers' socket only
-Version 1 had neither cause nor blocked_by, version 2 had neither permit, motion, speed nor release, version 3 no robot.
+Version 1 had neither cause nor blocked_by, version 2 had neither permit, motion, speed nor release, version 3 no robot,
+version 4 no state without a gyroscope (NaN).
 """
 
 from __future__ import annotations
 
+import math
 import struct
 from dataclasses import dataclass
 from typing import Final
@@ -21,7 +23,7 @@ from typing import Final
 from firmware_bridge.core.robot_state import BatteryState, RobotState
 
 MAGIC: Final = b"TVEB"
-VERSION: Final = 4
+VERSION: Final = 5
 STATES: Final = ("disarmed", "arming", "armed", "stopped")
 CAUSES: Final = (
     *("none", "client_stop", "client_lost", "deadman", "shutdown", "suspended"),
@@ -170,7 +172,8 @@ def decode(data: bytes) -> Message:
 
 def _pack_state(state: RobotState) -> bytes:
     motion = (*state.T_odom_base, state.vx_mps, state.vy_mps, state.wz_radps)
-    attitude = (state.position_z_m, state.roll_rad, state.pitch_rad, state.gyro_wz_radps)
+    gyro_wz_radps = math.nan if state.gyro_wz_radps is None else state.gyro_wz_radps
+    attitude = (state.position_z_m, state.roll_rad, state.pitch_rad, gyro_wz_radps)
     codes = (state.mode, state.error_code, state.robot_stamp_ns)
     return _STATE_BODY.pack(state.received_ns, *motion, *codes, *attitude, *state.foot_forces)
 
@@ -179,10 +182,8 @@ def _unpack_state(body: bytes) -> RobotState:
     received_ns, x, y, theta, vx, vy, wz, *rest = _STATE_BODY.unpack(body)
     mode, error_code, stamp_ns, z, roll, pitch, gyro_wz, *feet = rest
     fr, fl, rr, rl = feet
-    pose = (x, y, theta)
-    return RobotState(
-        received_ns, pose, vx, vy, wz, mode, error_code, stamp_ns, z, roll, pitch, gyro_wz, (fr, fl, rr, rl)
-    )
+    pose, gyro = (x, y, theta), None if math.isnan(gyro_wz) else gyro_wz
+    return RobotState(received_ns, pose, vx, vy, wz, mode, error_code, stamp_ns, z, roll, pitch, gyro, (fr, fl, rr, rl))
 
 
 def _decode_status(body: bytes) -> BridgeStatus:

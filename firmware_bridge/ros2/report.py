@@ -45,7 +45,7 @@ def robot_state(
 
     `velocity_frame`: "body" for the message's definition (the twist is in the child frame), "odom" for a base that
     reports it in the header's frame. `attitude`: the IMU's newest report, for gyroscope, roll and pitch; without it
-    the odometry's own yaw rate and orientation stand for them.
+    there is no gyroscope, and the odometry's own orientation stands for roll and pitch.
     """
     position, twist = sample.pose.pose.position, sample.twist.twist
     rpy, stamp_ns = rpy_rad(sample.pose.pose.orientation), stamp_ns_of(sample.header.stamp)
@@ -62,7 +62,7 @@ def robot_state(
     if velocity_frame == "odom":
         cos, sin = math.cos(theta_rad), math.sin(theta_rad)
         vx_mps, vy_mps = cos * vx_mps + sin * vy_mps, cos * vy_mps - sin * vx_mps
-    gyro_wz_radps = angular.z if attitude is None else attitude.wz_radps
+    gyro_wz_radps = None if attitude is None else attitude.wz_radps
     if attitude is not None and attitude.roll_rad is not None and attitude.pitch_rad is not None:
         roll_rad, pitch_rad = attitude.roll_rad, attitude.pitch_rad
     pose = (position.x, position.y, theta_rad)

@@ -114,6 +114,54 @@ def test_without_a_gyro_the_camera_holds_the_heading() -> None:
     assert abs(offset_error(path, seeing, last, 250)[2]) < 0.3 * abs(offset_error(path, alone, last, 250)[2])
 
 
+def turned_rad(estimator: DriftEstimator, report: OdometryInputs) -> float:
+    outputs = estimator.step(report, report.received_ns)
+    assert outputs.pose is not None
+    return outputs.pose.T_odom_base.theta_rad
+
+
+def at_rest(index: int, **fields: object) -> OdometryInputs:
+    """The report number `index`, 20 a second, of a robot without a command."""
+    stamp_ns = (index + 1) * SECOND_NS // 20
+    still = OdometryInputs(stamp_ns, (0.0, 0.0, 0.0), 0.0, 0.0, 0.0, robot_stamp_ns=stamp_ns, commanded=(0.0, 0.0, 0.0))
+    return replace(still, **fields)
+
+
+def test_without_a_gyro_the_camera_corrects_a_turn_on_the_spot() -> None:
+    """Wheels that report a tenth too much, over 286 degrees."""
+    path, estimator = drive(12, vx_mps=0.0, wz_radps=0.5), DriftEstimator()
+    path = replace(
+        path,
+        reports=tuple(
+            replace(r, gyro_wz_radps=None, wz_radps=1.1 * r.wz_radps, T_odom_base=(0.0, 0.0, 1.1 * (pose.theta_rad)))
+            for r, pose in zip(path.reports, path.true, strict=True)
+        ),
+    )
+    run(path, estimator, visual_motions(path))
+    assert estimator.visual_used > 15
+    last = len(path.true) - 1
+    assert abs(math.degrees(offset_error(path, estimator, last, 250)[2])) < 6.0  # 14 without a camera
+
+
+def test_a_robot_that_is_turned_by_hand_turns_and_teaches_the_gyro_nothing() -> None:
+    estimator, rate, theta = DriftEstimator(), math.radians(3.0), 0.0
+    for index in range(600):
+        turns = 100 <= index < 500
+        heading = theta + rate / 20 * max(0, min(index, 500) - 100)
+        rates = {"wz_radps": rate * turns, "gyro_wz_radps": rate * turns}
+        found = turned_rad(estimator, at_rest(index, T_odom_base=(0.0, 0.0, heading), **rates))
+    assert math.degrees(found) == pytest.approx(60.0, abs=1.5)
+    assert abs(math.degrees(estimator.gyro_bias_radps)) < 0.1
+
+
+def test_after_a_long_rest_a_bias_that_changes_is_learned_within_half_a_minute() -> None:
+    estimator = DriftEstimator()
+    for index in range(12_600):
+        bias = math.radians(0.2 if index < 12_000 else 0.6)
+        turned_rad(estimator, at_rest(index, gyro_wz_radps=bias))
+    assert math.degrees(estimator.gyro_bias_radps) == pytest.approx(0.6, abs=0.1)
+
+
 def test_the_calibration_takes_a_known_scale_out_without_a_camera() -> None:
     path = drive(10, scale=1.05)
     estimator = DriftEstimator(OdometryCalibration(scale_x=1.05, scale_x_sigma=0.002))

@@ -171,7 +171,7 @@ def test_a_robots_clock_that_is_set_back_during_a_silence_is_not_lag() -> None:
     assert all(not v.findings for v in verdicts)
 
 
-@pytest.mark.parametrize("ppm", [-90, 90])
+@pytest.mark.parametrize("ppm", [-450, 450])
 def test_a_robots_clock_that_runs_a_little_fast_or_slow_is_no_delay(ppm: int) -> None:
     reports = [
         report(i, robot_stamp_ns=round((i + 1) * STEP_NS * (1 + ppm * 1e-6)) + 10**9) for i in range(0, 200000, 40)

@@ -38,7 +38,12 @@ statuses = st.builds(
     BridgeStatus, i64, st.sampled_from(STATES), reasons, u64, u64, u64, st.tuples(f64, f64, f64), st.booleans(),
     st.sampled_from(CAUSES), st.sampled_from(CAUSES), st.sampled_from(PERMITS), st.sampled_from(MOTIONS), f64,
 )  # fmt: skip
-messages = st.one_of(st.just(Arm()), st.just(Stop()), st.just(Release()), velocities, statuses)
+i32 = st.integers(-(2**31), 2**31 - 1)
+states = st.builds(
+    RobotState, i64, st.tuples(f64, f64, f64), f64, f64, f64, i64, i64, i64, f64, f64, f64, st.none() | f64,
+    st.tuples(i32, i32, i32, i32),
+)  # fmt: skip
+messages = st.one_of(st.just(Arm()), st.just(Stop()), st.just(Release()), velocities, statuses, states)
 
 
 @given(messages)
@@ -111,15 +116,15 @@ def test_any_kind_with_a_body_of_any_length_is_a_message_or_a_link_error(kind: i
         assert encode(decode(struct.pack("<4sBBH", b"TVEB", VERSION, kind, len(body)) + body))[5] == kind
 
 
-def test_kinds_layout_and_size_are_those_of_version_4() -> None:
+def test_kinds_layout_and_size_are_those_of_version_5() -> None:
     zero = (0.0, 0.0, 0.0)
     state = RobotState(1, zero, 0.0, 0.0, 0.0, 2, 3, 4, 0.0, 0.0, 0.0, 0.0, (5, 6, 7, 8))
     status = BridgeStatus(9, "stopped", "why", 1, 2, 3, zero, True, "client_stop", "estop", "given", "moving", 0.5)
     heads = [encode(message)[:8].hex() for message in (Arm(), Stop(), Velocity(1, 2, 0, 0, 0), status, Release())]
     heads += [encode(message)[:8].hex() for message in (state, BatteryState(1, 80, 29.0, 1.0))]
     assert heads == [
-        *("5456454204010000", "5456454204020000", "5456454204032800", "5456454204045100"),
-        *("5456454204050000", "5456454204068000", "5456454204072000"),
+        *("5456454205010000", "5456454205020000", "5456454205032800", "5456454205045100"),
+        *("5456454205050000", "5456454205068000", "5456454205072000"),
     ]
     assert encode(Velocity(1, 2, 0.5, 0.0, 0.0))[8:] == struct.pack("<Qq3d", 1, 2, 0.5, 0, 0)
     assert encode(status)[8:22] == struct.pack("<q6B", 9, 3, 1, 1, 6, 2, 2)

@@ -60,7 +60,8 @@ def test_a_report_becomes_the_state_it_describes() -> None:
     state = robot_state(odometry(math.pi / 2), 7, "body")
     assert state is not None
     assert state.T_odom_base == pytest.approx((1.0, 2.0, math.pi / 2))
-    assert (state.vx_mps, state.vy_mps, state.wz_radps, state.gyro_wz_radps) == (0.5, 0.0, 0.2, 0.2)
+    assert (state.vx_mps, state.vy_mps, state.wz_radps) == (0.5, 0.0, 0.2)
+    assert state.gyro_wz_radps is None, "wheels are no gyroscope"
     assert (state.received_ns, state.robot_stamp_ns) == (7, 3_250_000_000)
 
 
