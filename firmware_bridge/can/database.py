@@ -257,6 +257,9 @@ class _Loader:
             found = f"{signal.low:g}..{signal.high:g}"
             need = f"{low:g}..{high:g}"
             require(fits, f"can.command: {signal}: expected a range of at least {need} (limits), found {found}")
+            rest = abs(signal.offset + round(-signal.offset / signal.scale) * signal.scale)
+            stands = rest <= 1e-6 * abs(signal.scale)  # what floating-point numbers leave
+            require(stands, f"can.command: {signal}: expected a raw value for exactly 0, found none: it could not stop")
         rate_hz, cycle_ns = self._config.bridge.rate_hz, sent[vx.message].cycle_ns
         slow = cycle_ns > 0 and cycle_ns * rate_hz < 1_000_000_000
         need = f"{1_000_000_000 / cycle_ns:g} at least" if cycle_ns else ""

@@ -54,6 +54,7 @@ class RobotLink:
         self._commanders = PublisherWatch(bus, {command: settings.other_command_publishers})
         self._order = StampOrder()
         self._attitude: Attitude | None = None
+        self._has_tilt = False  # whether the IMU has reported an orientation
         self._clock: tuple[int, int] | None = None  # the base's newest stamp and when it was received, ns
         self._malformed = self._failed_writes = self._failing = 0
         if settings.supervised:
@@ -118,6 +119,7 @@ class RobotLink:
             found = None if sample is None else attitude(sample, time.monotonic_ns())
             self._malformed += found is None
             self._attitude = found or self._attitude
+            self._has_tilt |= found is not None and found.roll_rad is not None
 
     def _newest_state(self) -> RobotState | None:
         newest = None
@@ -155,6 +157,9 @@ class RobotLink:
             )
         if self._imu is not None and (self._attitude is None or now_ns - self._attitude.received_ns > _IMU_SILENT_NS):
             return f"no usable message on {self._settings.topic(self._settings.imu)} for {_IMU_SILENT_NS / 1e6:.0f} ms"
+        if self._has_tilt and self._attitude is not None and self._attitude.roll_rad is None:
+            # A tilt that cannot be told is not level.
+            return f"{self._settings.topic(self._settings.imu)} reports no orientation any more"
         return None
 
 

@@ -142,6 +142,7 @@ DBC_CHANGES = [
     ("BO_ 272 VelocityCommand: 6 Controller", "BO_ 272 VelocityCommand: 6 Base", "expected Controller as its sender"),
     (VX, '(0.001,0) [-0.1|0.1] "m/s" Base', "expected a range of at least -0.4"),
     (VX, '(0,0) [0|0] "m/s" Base', "can.command.vx: VelocityCommand.Vx: expected a factor other than 0"),
+    (VX, '(0.05,0.02) [-2|2] "m/s" Base', "VelocityCommand.Vx: expected a raw value for exactly 0, found none"),
     (VX, f'({"9" * 400},0) [0|0] "m/s" Base', TOO_LARGE),
     (VX, f'(1,{"9" * 400}) [0|0] "m/s" Base', TOO_LARGE),
     (VX, f'(0.001,0) [{"9" * 400}|{"9" * 401}] "m/s" Base', "expected a range of at least -0.4"),

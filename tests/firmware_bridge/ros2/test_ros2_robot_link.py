@@ -199,6 +199,19 @@ def test_a_tilted_imu_tips_a_base_with_flat_odometry(opened: Opener) -> None:
     wait_for(tilted, 5, "the tilt")
 
 
+def test_an_imu_that_loses_its_orientation_forbids_motion(opened: Opener) -> None:
+    link, base = opened()
+    read_until(link, base, lambda report: report.unsafe is None)
+    without = imu()
+    without.orientation_covariance = [-1.0, *[0.0] * 8]
+
+    def report() -> str | None:
+        base.imu.write(without)
+        return link.read(time.monotonic_ns()).unsafe
+
+    wait_for(lambda: report() == "rt/imu reports no orientation any more", 5, "the loss")
+
+
 def test_an_old_stamp_is_dropped_and_counted(opened: Opener) -> None:
     link, base = opened()
     read_until(link, base, lambda report: report.state)
