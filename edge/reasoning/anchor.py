@@ -60,17 +60,19 @@ class Anchor:
         return min(newest_ns, self.planned_ns + self.late_ns)
 
 
-def older_frames(ring: TokenRing, plan: Anchor, offsets_s: Sequence[float]) -> Iterator[EncodedFrame]:
+def older_frames(
+    ring: TokenRing, plan: Anchor, offsets_s: Sequence[float], from_ns: int | None = None
+) -> Iterator[EncodedFrame]:
     """Yield the frames before the newest, oldest first; `offsets_s`: ages, s, in descending order.
 
+    `from_ns`: when the instruction was given, if another one came before it. Its frames are no part of this task: in
+    training a drive begins with its instruction.
     Each frame is fetched only on iteration: with a slow model it may not have been captured earlier.
     """
-    last_ns: int | None = None
+    last_ns = (from_ns or 0) - 1
     for offset_s in offsets_s:
         frame = ring.nearest(plan.older_ns(offset_s))
-        if frame is None or not plan.is_older(frame.stamp_ns):
-            continue
-        if last_ns is not None and frame.stamp_ns <= last_ns:
+        if frame is None or not plan.is_older(frame.stamp_ns) or frame.stamp_ns <= last_ns:
             continue
         last_ns = frame.stamp_ns
         yield frame

@@ -90,7 +90,7 @@ class InstructionMemory:
 
     def __init__(self, from_ns: int | None, instruction: str, decoding: Decoding = Decoding.CONSTRAINED) -> None:
         """`from_ns`: the newest frame's stamp when the instruction was given; None: the path begins at any frame."""
-        self._from_ns = from_ns
+        self.from_ns = from_ns
         self._decoding = decoding
         self._path = PathMemory()
         self._context = DecodingContext()
@@ -142,7 +142,7 @@ class InstructionMemory:
                 self._put(stamp_ns, T_odom_base)
 
     def _put(self, stamp_ns: int, T_odom_base: SE2) -> None:
-        if self._from_ns is None or stamp_ns >= self._from_ns:
+        if self.from_ns is None or stamp_ns >= self.from_ns:
             self._path.put(stamp_ns, T_odom_base)
             self._turn.put(stamp_ns, T_odom_base)
 

@@ -267,7 +267,8 @@ class ReasoningLoop:
         prefix_ns = min(self._prefixes_ns, default=0)
         plan = Anchor.after(begun_ns, prefix_ns) if self._late_anchor else Anchor.now(begun_ns)
         prefill_started_ns = self._clock()
-        for number, frame in enumerate(older_frames(self._ring, plan, self._offsets_s), 1):
+        older = older_frames(self._ring, plan, self._offsets_s, task.job.memory.from_ns)
+        for number, frame in enumerate(older, 1):
             task.older.append(frame)
             task.prefill(run, number, frame)
         self._prefixes_ns.append(self._clock() - prefill_started_ns)

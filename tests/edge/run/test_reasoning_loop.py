@@ -150,6 +150,17 @@ def test_older_frames_are_prefilled_before_the_newest_is_captured(bench: Bench, 
     assert bench.loop.times.late_anchor_ms.newest == pytest.approx(400.0)
 
 
+def test_frames_from_before_the_instruction_are_no_part_of_its_prompt(bench: Bench, clock: Clock) -> None:
+    for tenth in range(900, 1001):
+        bench.frame(tenth / 10)
+    bench.loop.submit("go to the bench")
+    for tenth in range(1001, 1041):
+        bench.frame(tenth / 10)
+    clock.s = 104.0
+    bench.loop.step()
+    assert bench.language.prompts[0] == pytest.approx([101.0, 104.0])
+
+
 def test_the_newest_frame_is_waited_for_until_its_planned_instant() -> None:
     with Bench() as bench:
         for tenth in range(70, 101):
