@@ -59,9 +59,13 @@ def percentile(samples: Array, percent: float) -> float:
 
 
 def draw_histogram(axes: Axes, samples: Array, bin_width: float, colour: str, unit: str, digits: int) -> None:
-    """Draw a histogram from 0 with lines at p50, p99 and the maximum."""
+    """Draw a histogram from 0 with lines at p50, p99 and the maximum.
+
+    Bins are centred on the multiples of their width: on an edge, rounding would decide between two bins.
+    """
     largest = float(samples.max())
-    axes.hist(samples, bins=np.arange(0, largest + bin_width, bin_width).tolist(), color=colour)
+    bins = (np.arange(int(largest / bin_width + 0.5) + 2) - 0.5) * bin_width
+    axes.hist(samples, bins=bins.tolist(), color=colour)
     lines = (("p50", percentile(samples, 50), ":", INK), ("p99", percentile(samples, 99), "--", INK))
     for name, value, dash, line_colour in (*lines, ("max", largest, "-", MUTED)):
         label = f"{name} {value:.{digits}f} {unit}"

@@ -24,8 +24,11 @@ class Metrics:
     def __init__(self) -> None:
         self._registry = CollectorRegistry()
 
-        def gauge(name: str, text: str, *labels: str) -> Gauge:
-            return Gauge(f"tic_vla_{name}", text, labels, registry=self._registry)
+        def gauge(name: str, text: str, *labels: str, begin: float = math.nan) -> Gauge:
+            made = Gauge(f"tic_vla_{name}", text, labels, registry=self._registry)
+            if not labels:
+                made.set(begin)
+            return made
 
         self._tick = Histogram(
             "tic_vla_tick_seconds",
@@ -41,15 +44,16 @@ class Metrics:
         )
         self._tokens = Counter("tic_vla_generated_tokens", "Tokens of the reasoning text.", registry=self._registry)
         self._faults = Counter("tic_vla_faults", "Faults raised.", ("name", "action"), registry=self._registry)
-        self._dropped = gauge("view_dropped_records", "Records that the view did not receive or could not read.")
-        self._unsaved = gauge("log_dropped_records", "Records that may be missing in the flight log.")
-        self._ticks = gauge("ticks", "Number of ticks of the control thread.")
-        self._missed = gauge("missed_ticks", "Number of ticks left out because an earlier one was late.")
+        lost = "Records that the view did not receive or could not read."
+        self._dropped = gauge("view_dropped_records", lost, begin=0)
+        self._unsaved = gauge("log_dropped_records", "Records that may be missing in the flight log.", begin=0)
+        self._ticks = gauge("ticks", "Number of ticks of the control thread.", begin=0)
+        self._missed = gauge("missed_ticks", "Number of ticks left out because an earlier one was late.", begin=0)
         self._delay = gauge("delay_seconds", "Delay from the anchor's frame to now.")
         self._frame_age = gauge("frame_age_seconds", "Age of the frame that the policy saw.")
         self._speed = gauge("speed_mps", "Forward speed.", "kind")
         self._yaw = gauge("yaw_rate_radps", "Yaw rate, left positive.", "kind")
-        self._active = gauge("faults_active", "Number of faults present.")
+        self._active = gauge("faults_active", "Number of faults present.", begin=0)
         self._power = gauge("power_watts", "Power now.", "tagged")
         self._budget = gauge("power_budget_watts", "Power budget of the target.")
         self._temperature = gauge("temperature_celsius", "Hottest sensor of the board.")

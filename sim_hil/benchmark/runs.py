@@ -124,6 +124,7 @@ def bench_result(run: BenchRun, store: ResultStore, *, finished: bool, started_n
     """Return the result for `--json`."""
     results = sorted(store.results, key=lambda result: result.id)
     wall_s = (time.monotonic_ns() - started_ns) / 1e9
+    causes, failed = read_causes(store.directory, results), any(not each.success or each.collided for each in results)
     return {
         "summary": {
             **summarise(results),
@@ -131,7 +132,7 @@ def bench_result(run: BenchRun, store: ResultStore, *, finished: bool, started_n
             "failed_runs": len(store.failed),
             "finished": finished,
         },
-        "causes": cause_counts(results, read_causes(store.directory, results)),
+        "causes": None if failed and not causes else cause_counts(results, causes),
         "episodes": [result.as_json() for result in results],
         "failed_runs": [asdict(failed) for failed in store.failed],
         "latency": latency_result(store.directory, run.conditions, results),

@@ -59,16 +59,6 @@ def _failure(path: Path, result: EpisodeResult) -> Failure | None:
     return Failure(result, decisive, shown, None if at_ns is None else pictures.get(at_ns))
 
 
-def counts(found: Sequence[Failure]) -> dict[str, dict[str, int]]:
-    """Return the number of episodes by outcome ("missed", "collided") and cause, the most frequent first."""
-    return {
-        name: dict(
-            Counter(each.decisive.verdict.cause for each in found if each.result.success == success).most_common()
-        )
-        for name, success in (("missed", False), ("collided", True))
-    }
-
-
 def cause_table(found: Sequence[Failure]) -> Table:
     """Return the table of causes: what went wrong first, in how many episodes that missed the goal or only collided."""
     keys = Counter((each.decisive.verdict.cause, general_reason(each.decisive)) for each in found)

@@ -156,6 +156,15 @@ def test_the_metrics_are_those_of_the_newest_records() -> None:
     assert text.endswith("# EOF\n")
 
 
+def test_what_has_not_been_reported_yet_is_no_number() -> None:
+    metrics = Metrics()
+    for name in ("battery_percent", "temperature_celsius", "power_budget_watts", "delay_seconds", "frame_age_seconds"):
+        assert samples(metrics, name) == [f"tic_vla_{name} NaN"]
+    assert samples(metrics, "ticks ") == ["tic_vla_ticks 0.0"] and samples(metrics, "faults_active") == [
+        "tic_vla_faults_active 0.0"
+    ]
+
+
 def test_missed_ticks_and_records_lost_from_the_log_are_metrics() -> None:
     metrics = Metrics()
     metrics.take("/tick", tick(missed=2))

@@ -230,7 +230,17 @@ def test_a_run_that_has_ended_says_so_until_the_next_one() -> None:
         sockets[0].lose();
         found.push(text("link"));
     """
-    assert watch(scenario) == ["the run has ended", "the run has ended, waiting for the next one"]
+    ended, lost = watch(scenario)
+    assert ended == "the run has ended"
+    assert lost == "the run has ended, waiting for the next one; if it prints another address, open that"
+
+
+def test_a_run_that_has_ended_says_why() -> None:
+    scenario = """
+        sockets[0].open(); run(1e9); sockets[0].say("/result", 3e9, { faults: ["an operator pressed the stop"] });
+        found.push(elements.faults.children.map(item => item.children[0].textContent));
+    """
+    assert watch(scenario) == [["2.0 s · the run ended: an operator pressed the stop"]]
 
 
 def test_faults_are_drawn_over_time() -> None:

@@ -17,7 +17,7 @@ from edge.flightlog.standard_messages import jpeg_size
 from sim_hil.benchmark.env.metrics import Outcome
 from sim_hil.benchmark.results import causes as causes_of
 from sim_hil.benchmark.results.causes import cause_counts, cause_tables, keep_cause, read_causes
-from sim_hil.benchmark.results.failures import cause_table, counts, failure_sheet, failures
+from sim_hil.benchmark.results.failures import cause_table, failure_sheet, failures
 from sim_hil.benchmark.results.flight import EpisodeFlight
 from sim_hil.scene.scene import load_scene
 from tests.edge.flightlog.test_log_schemas import SAMPLES
@@ -47,7 +47,6 @@ RESULTS = [
 
 def test_failures_are_counted_by_cause(run: Path) -> None:
     found = failures(run, RESULTS)
-    assert counts(found) == {"missed": {"command limited": 2}, "collided": {"action expert": 1}}
     rows = cause_table(found).rows
     assert [tuple(row)[2:5] for row in rows] == [("2", "0", "67"), ("0", "1", "33")]
     assert rows[0][1] == "the plan drives, the command does not: camera-frozen"
