@@ -38,7 +38,7 @@ from firmware_bridge.system.line_log import LineLog
 from firmware_bridge.system.notify import Notifier
 from firmware_bridge.system.output_file import check_output, write_descriptor, write_output
 from firmware_bridge.system.process import lock_memory, settle_memory, signals_to_socket
-from firmware_bridge.system.terminal import CommandParser, one_line
+from firmware_bridge.system.terminal import CommandParser, one_line, open_missing_streams, print_line
 
 _OPERATORS: Final = 4  # at a time
 _OBSERVERS: Final = 4
@@ -314,6 +314,7 @@ def serve(config: RobotConfig, latch_path: Path, groups: SocketGroups) -> dict[s
 
 def main(argv: list[str] | None = None) -> int:
     """Command line; see EPILOG for the exit codes."""
+    open_missing_streams()
     parser = CommandParser(
         prog="edge-bridge",
         description="The only process that commands the robot: gates velocity commands and stops the robot within"
@@ -336,8 +337,7 @@ def main(argv: list[str] | None = None) -> int:
     if "--version" in (sys.argv[1:] if argv is None else argv):
         from firmware_bridge.core.version import version_line  # not part of the process that serves
 
-        sys.stdout.write(f"{version_line('edge-bridge')}\n")
-        return 0
+        return _write_result(f"{version_line('edge-bridge')}\n")
     args = parser.parse_args(argv)
     try:
         if args.json not in (None, "-") and args.command != "stop":  # nothing may come before a stop
@@ -366,20 +366,23 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:  # of a process that serves it is a signal to leave
         _print(f"{args.command} interrupted, perhaps after it was sent; see: edge-bridge status")
         return 130
-    text = json.dumps(result, indent=2) + "\n"
+    return code if args.json is None else max(code, _write_result(json.dumps(result, indent=2) + "\n", args.json))
+
+
+def _write_result(text: str, where: str = "-") -> int:
     try:
-        if args.json == "-":
+        if where == "-":
             write_descriptor(sys.stdout.fileno(), text.encode())
-        elif args.json is not None:
-            write_output(Path(args.json), text.encode())
+        else:
+            write_output(Path(where), text.encode())
     except OSError as error:
         _print(f"the result could not be written: {error.strerror or error}")
         return 1
-    return code
+    return 0
 
 
 def _print(message: object) -> None:
-    sys.stderr.write(f"edge-bridge: {one_line(message)}\n")
+    print_line(f"edge-bridge: {one_line(message)}")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import os
-import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -26,7 +25,7 @@ from firmware_bridge.core.config import (
     runtime_dirs,
 )
 from firmware_bridge.core.link import BridgeStatus, Stop
-from firmware_bridge.system.terminal import one_line
+from firmware_bridge.system.terminal import one_line, print_line
 
 CONFIRM_S: Final = 1.0
 _STAND_S: Final = 2.0  # for the robot to come to rest and report it: 0.8 m/s at 1 m/s2, and half as much again
@@ -50,8 +49,7 @@ Say = Callable[[str], None]
 
 def _write(text: str) -> None:
     """Write one line of `edge-bridge` to stderr."""
-    sys.stderr.write(f"edge-bridge: {text}\n")
-    sys.stderr.flush()
+    print_line(f"edge-bridge: {text}")
 
 
 def sockets_of(command: str, robot: str, socket: Path | None, say: Say = _write) -> tuple[Path, ...]:

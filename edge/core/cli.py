@@ -25,7 +25,7 @@ from firmware_bridge.system.output_file import (
     replace_regular,
     write_output,
 )
-from firmware_bridge.system.terminal import one_line
+from firmware_bridge.system.terminal import one_line, open_missing_streams, print_line
 
 P = ParamSpec("P")
 
@@ -34,6 +34,8 @@ EXIT_CHECK_FAILED = 1
 EXIT_BAD_INPUT = 2
 EXIT_REFUSED = 3
 EXIT_INTERRUPTED = 130
+LONGEST_S = 2_592_000.0
+"""Longest `--duration` of a run, s: 30 days."""
 
 
 class OutputError(RuntimeError):
@@ -146,8 +148,7 @@ def messages(name: str) -> Callable[[str], None]:
     """Return a function that writes `name: line` to standard error at once."""
 
     def write(line: str) -> None:
-        sys.stderr.write(f"{name}: {one_line(line)}\n")
-        sys.stderr.flush()
+        print_line(f"{name}: {one_line(line)}")
 
     return write
 
@@ -166,6 +167,7 @@ def command_line(
     def decorate(main: Callable[P, int]) -> Callable[P, int]:
         @functools.wraps(main)
         def run(*args: P.args, **kwargs: P.kwargs) -> int:
+            open_missing_streams()
             try:
                 try:
                     code = main(*args, **kwargs)
@@ -179,7 +181,7 @@ def command_line(
                     sys.stdout.flush()
                 return code
             except (OutputError, OSError) as error:
-                if isinstance(error, OSError) and error.errno not in (errno.ENOSPC, errno.EPIPE):
+                if isinstance(error, OSError) and error.errno not in (errno.ENOSPC, errno.EPIPE, errno.EBADF):
                     raise
                 report(describe_os_error(error, "an output") if isinstance(error, OSError) else str(error))
                 _give_up_stdout()
@@ -236,6 +238,15 @@ def missing_extra(error: ModuleNotFoundError, extra: str = "") -> str | None:
     return f"needs the packages of the extra {needed!r} ({name} is missing): pip install 'tic-vla-edge[{needed}]'{also}"
 
 
+def _print_version(command: str) -> int:
+    @command_line(command)
+    def print_it() -> int:
+        sys.stdout.write(f"{version_line(command)}\n")
+        return EXIT_DONE
+
+    return print_it()
+
+
 def run_with_extra(command: str, module: str, extra: str = "", arguments: str = "") -> int:
     """Run `module.main()`; `--version` needs none of its packages, a missing extra is one line that names it.
 
@@ -244,8 +255,8 @@ def run_with_extra(command: str, module: str, extra: str = "", arguments: str = 
     """
     report = messages(command)
     if sys.argv[1:] == ["--version"]:
-        sys.stdout.write(f"{version_line(command)}\n")
-        return EXIT_DONE
+        return _print_version(command)
+    open_missing_streams()
     try:
         if arguments:
             first = importlib.import_module(arguments)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
-import math
 import os
 import signal
 import sys
@@ -24,6 +23,7 @@ from edge.core.cli import (
     EXIT_DONE,
     EXIT_INTERRUPTED,
     EXIT_REFUSED,
+    LONGEST_S,
     OutputError,
     check_result_target,
     command_line,
@@ -149,8 +149,8 @@ def parser() -> argparse.ArgumentParser:
 
 def read_options(args: argparse.Namespace) -> tuple[RobotConfig, RunOptions]:
     """Everything that can be refused without looking at the robot or the artifacts."""
-    if args.duration is not None and not (math.isfinite(args.duration) and args.duration > 0):
-        raise ConfigError(f"--duration {args.duration}: expected a positive number of seconds")
+    if args.duration is not None and not 0 < args.duration <= LONGEST_S:
+        raise ConfigError(f"--duration {args.duration}: expected seconds above 0 and up to {LONGEST_S:g} (30 days)")
     check_result_target(args.json)
     if args.record is not None:
         there = [part for part in parts(args.record) if part.exists()]

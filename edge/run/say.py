@@ -23,7 +23,7 @@ from edge.core.cli import (
 )
 from edge.run.stop_phrase import is_stop_phrase
 from firmware_bridge.core.config import OPERATOR_SUFFIX, ROBOT_FILE_SOCKET, SERVICE_SOCKET, runtime_dirs
-from firmware_bridge.system.terminal import CommandParser
+from firmware_bridge.system.terminal import CommandParser, one_line
 
 ANSWER_S = 2.0
 STOP_ANSWER_S = 3.0  # the runner waits up to 2 s for the robot to stand still
@@ -124,7 +124,7 @@ def _answer(asking: socket.socket, path: Path, timeout_s: float) -> Any:
         return json.loads(asking.recv(65_536))
     except TimeoutError:
         raise SayError(f"{path}: no answer within {timeout_s:g} s; expected a runner that drives there") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise SayError(f"{path}: expected a runner's answer, found something else ({error})") from error
 
 
@@ -135,7 +135,7 @@ def _stop_answer(asking: socket.socket, path: Path) -> dict[str, Any] | None:
     except (SayError, OSError) as error:
         _print(str(error))
         return None
-    if isinstance(answer, dict) and "stopped" in answer and "bridge" in answer:
+    if isinstance(answer, dict) and "stopped" in answer and str(answer.get("bridge", "\0")).isprintable():
         return answer
     _print(f"{path}: expected the runner to stop, found the answer {answer}")
     return None
@@ -194,7 +194,7 @@ def _hand_over(path: Path, text: str) -> int:
     except OSError as error:
         _print(f"{path}: expected the socket of a runner ({error.strerror or error})")
         return EXIT_BAD_INPUT
-    sys.stdout.write(f"{accepted}\n")
+    sys.stdout.write(f"{one_line(accepted)}\n")
     return EXIT_DONE
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import os
 import sys
 from typing import Any, Final, NoReturn
 
@@ -17,6 +19,33 @@ def one_line(text: object) -> str:
         half = LONGEST_LINE // 2 - 10
         line = f"{line[:half]} [...] {line[-half:]}"
     return line
+
+
+def print_line(line: str) -> None:
+    """Write a line to standard error at once. One that cannot be written is dropped: a stop must not wait for it."""
+    with contextlib.suppress(OSError, ValueError):
+        if sys.stderr is not None:
+            sys.stderr.write(f"{line}\n")
+            sys.stderr.flush()
+
+
+def open_missing_streams() -> None:
+    """Give a process that was started without standard streams some: no file or socket may get their numbers.
+
+    What is written to such a standard output is an error, as on a full disk; standard error takes everything.
+    """
+    for number, flags in ((0, os.O_RDONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
+        try:
+            os.fstat(number)
+        except OSError:
+            opened = os.open(os.devnull, flags)
+            if opened != number:
+                os.dup2(opened, number)
+                os.close(opened)
+    if sys.stdout is None:
+        sys.stdout = os.fdopen(1, "w", encoding="utf-8", closefd=False)
+    if sys.stderr is None:
+        sys.stderr = os.fdopen(2, "w", encoding="utf-8", closefd=False)
 
 
 class CommandParser(argparse.ArgumentParser):

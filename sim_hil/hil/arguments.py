@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from edge.core.cli import check_result_target
+from edge.core.cli import LONGEST_S, check_result_target
 from edge.live.options import add_live_arguments
 from firmware_bridge.core.config import ConfigError
 from firmware_bridge.system.terminal import CommandParser
@@ -136,8 +136,8 @@ def check(args: argparse.Namespace) -> Scene:
     check_flags(args.protocol, [flag for flag in FLAGS if getattr(args, flag.removeprefix("--")) is not None])
     if args.gui:
         check_display(os.environ.get("DISPLAY"))
-    if args.duration is not None and not 0 < args.duration < math.inf:
-        raise ConfigError(f"--duration: expected seconds above 0, found {args.duration}")
+    if args.duration is not None and not 0 < args.duration <= LONGEST_S:
+        raise ConfigError(f"--duration: expected seconds above 0 and up to {LONGEST_S:g}, found {args.duration}")
     if args.people > MAX_PEOPLE:
         raise ConfigError(f"--people: expected at most {MAX_PEOPLE}, found {args.people}")
     if args.interface is not None and args.interface not in [name for _, name in socket.if_nameindex()]:

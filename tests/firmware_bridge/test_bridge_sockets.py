@@ -6,6 +6,8 @@ import errno
 import io
 import os
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -28,7 +30,7 @@ from firmware_bridge.core.link import Arm, BridgeStatus, Message, Stop
 from firmware_bridge.operate import operate
 from firmware_bridge.system.line_log import LineLog
 from firmware_bridge.system.notify import Notifier
-from tests.support.processes import GO2_SIM
+from tests.support.processes import GO2_SIM, REPOSITORY
 
 
 @pytest.fixture
@@ -229,3 +231,13 @@ class TestRemoved:
             other.send(b"x")
             running.result(5.0)
         assert bridge.failed is None and not path.exists()
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("errors", ["2>/dev/full", "2>&-"], ids=["full", "closed"])
+@pytest.mark.parametrize("program", ["firmware_bridge.bridge stop --robot none.toml", "edge.run.say stop --to none"])
+def test_a_stop_is_sent_although_no_message_can_be_written(path: Path, program: str, errors: str) -> None:
+    command = f"{sys.executable} -m {program} --socket {path} {errors}"
+    with answering(path) as (bridge,):
+        done = subprocess.run(["sh", "-c", command], cwd=REPOSITORY, capture_output=True, check=False, timeout=60)
+    assert Stop() in bridge.received and done.returncode == 0
