@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import product
 from math import cos, sin
 
 import cv2
@@ -123,5 +124,8 @@ def _fill(
 def _write(image: Image, text: str, at: tuple[int, int], colour: Colour) -> None:
     (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.34, 1)
     where = (at[0] - width // 2, at[1] + 4)
-    cv2.putText(image, text, where, cv2.FONT_HERSHEY_SIMPLEX, 0.34, (255, 255, 255), 3, cv2.LINE_AA)
+    # A thicker text would be wider in OpenCV 5, and its white edge beside the text.
+    for right, down in product((-1, 0, 1), repeat=2):
+        edge_at = (where[0] + right, where[1] + down)
+        cv2.putText(image, text, edge_at, cv2.FONT_HERSHEY_SIMPLEX, 0.34, (255, 255, 255), 1, cv2.LINE_AA)
     cv2.putText(image, text, where, cv2.FONT_HERSHEY_SIMPLEX, 0.34, colour, 1, cv2.LINE_AA)

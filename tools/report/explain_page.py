@@ -69,6 +69,7 @@ def write_page(page: Path, log: Path, flight: Flight, found: Sequence[Explanatio
         "explain",
         title=f"Why: {log.name}",
         instruction=flight.instruction,
+        new_instructions=[(flight.seconds(at_ns), text) for at_ns, text in flight.new_instructions],
         source=str(log),
         truth=bool(flight.truths),
         tiles=tiles,

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, check_result_target, command_line, write_result
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, check_result_target, command_line, messages, write_result
 from edge.flightlog.explain.explanation import Explanation, deciding, explain
 from edge.flightlog.explain.flight import Flight, read_flight
 from edge.flightlog.reader import RecordingError
@@ -41,12 +41,18 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
+_print = messages("edge-replay explain")
+
+
 def as_result(path: Path, flight: Flight, found: Sequence[Explanation]) -> dict[str, Any]:
     """Return the explanations for --json; `decisive`: index of the event that cost the goal, None without one."""
     decisive = deciding(flight, found)
     return {
         "file": str(path),
         "instruction": flight.instruction,
+        "new_instructions": [
+            {"at_s": round(flight.seconds(at_ns), 1), "instruction": text} for at_ns, text in flight.new_instructions
+        ],
         "duration_s": round(flight.seconds(flight.end_ns), 1),
         "truth": bool(flight.truths),
         "events": [each.as_json() for each in found],
@@ -59,6 +65,7 @@ def as_result(path: Path, flight: Flight, found: Sequence[Explanation]) -> dict[
 def table(result: dict[str, Any]) -> str:
     """Format the explanations as text."""
     lines = [f"instruction: {result['instruction']}"]
+    lines += [f"instruction from {each['at_s']} s: {each['instruction']}" for each in result["new_instructions"]]
     if not result["events"]:
         lines.append("no stop of 2 s, collision, detour or timeout in this log")
     for number, event in enumerate(result["events"]):
@@ -80,6 +87,8 @@ def main(argv: Sequence[str] | None = None, write_page: PageWriter | None = None
     args = parser().parse_args(sys.argv[2:] if argv is None else argv)
     check_result_target(args.json)
     flight = read_flight(args.file)
+    if flight.notice is not None:
+        _print(flight.notice)
     found = explain(flight)
     result = as_result(args.file, flight, found)
     if args.page is not None:

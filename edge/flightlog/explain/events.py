@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from edge.flightlog.explain.flight import Flight
 from edge.flightlog.replay.records import RecordedTick
@@ -36,6 +37,8 @@ class Event:
     detail: str
     final: bool = False
     """Whether it is the stop that only a new arming ends."""
+    first: bool = False
+    """Whether it is a stop before the robot first moved."""
 
     @property
     def seconds(self) -> float:
@@ -69,18 +72,16 @@ def collisions(flight: Flight) -> list[Event]:
 
 
 def stops(flight: Flight) -> list[Event]:
-    """Return the spans of at least STOP_S in which the robot stood, after it first moved."""
+    """Return the spans of at least STOP_S in which the robot stood, also before it first moved."""
     found: list[Event] = []
     begin_ns: int | None = None
-    moved = False
     ticks = flight.ticks
     back = 0
     for tick in ticks:
         while ticks[back].now_ns < tick.now_ns - _BACK_NS:
             back += 1
         standing = _stands(ticks[back], tick)
-        moved = moved or not standing
-        if moved and standing and begin_ns is None:
+        if standing and begin_ns is None:
             begin_ns = ticks[back].now_ns
         if not standing and begin_ns is not None:
             _add_stop(found, ticks, begin_ns, tick.now_ns)
@@ -102,7 +103,9 @@ def final_stop(flight: Flight) -> list[Event]:
 
 
 def _stands(before: RecordedTick, now: RecordedTick) -> bool:
-    if before.pose is None or now.pose is None or now.now_ns - before.now_ns < _BACK_NS // 2:
+    if before.pose is None or now.pose is None:
+        return not any(now.command)
+    if now.now_ns - before.now_ns < _BACK_NS // 2:
         return True
     step = before.pose.inverse() @ now.pose
     return math.hypot(step.x_m, step.y_m) < STANDS_M and abs(step.theta_rad) < STANDS_RAD
@@ -116,7 +119,9 @@ def _add_stop(found: list[Event], ticks: Sequence[RecordedTick], begin_ns: int, 
         if begin_ns <= tick.now_ns <= end_ns:
             reasons[tick.reason] = reasons.get(tick.reason, 0) + 1
     most = max(reasons, key=lambda name: reasons[name])
-    found.append(Event(STOP, begin_ns, end_ns, f"{(end_ns - begin_ns) / 1e9:.1f} s, mostly {most}"))
+    first, whole = begin_ns == ticks[0].now_ns, end_ns == ticks[-1].now_ns
+    when = "; the robot never moved" if first and whole else "; before it first moved" if first else ""
+    found.append(Event(STOP, begin_ns, end_ns, f"{(end_ns - begin_ns) / 1e9:.1f} s, mostly {most}{when}", first=first))
 
 
 def detours_by_route(flight: Flight) -> list[Event]:
@@ -141,25 +146,57 @@ def _detour(begin_ns: int, end_ns: int, worst_m: float) -> Event:
     return Event(DETOUR, begin_ns, end_ns, f"the path to the goal grew by {worst_m:.1f} m")
 
 
+class _Place(NamedTuple):
+    """A place of the odometry's path, m; `length_m`: of the path up to it."""
+
+    at_ns: int
+    x_m: float
+    y_m: float
+    length_m: float
+
+    @property
+    def cell(self) -> tuple[float, float]:
+        """The square of LOOP_NEAR_M that contains the place."""
+        return self.x_m // LOOP_NEAR_M, self.y_m // LOOP_NEAR_M
+
+
+_Cells = dict[tuple[float, float], list[_Place]]
+
+
 def loops(flight: Flight) -> list[Event]:
-    """Return the loops of the odometry's path: it leads back to a place after more than LOOP_M."""
+    """Return the loops of the odometry's path: it leads back to a place after more than LOOP_M.
+
+    A new instruction begins a new path: it may lead the robot back.
+    """
     found: list[Event] = []
-    trail: list[tuple[int, float, float, float]] = []  # stamp, x, y, path length so far
+    changes_ns = [at_ns for at_ns, _ in flight.new_instructions]
+    cells: _Cells = {}
+    last: _Place | None = None
     for tick in flight.ticks:
         if tick.pose is None:
             continue
+        if changes_ns and changes_ns[0] <= tick.now_ns:
+            changes_ns = [at_ns for at_ns in changes_ns if at_ns > tick.now_ns]
+            cells, last = {}, None
         x_m, y_m = tick.pose.x_m, tick.pose.y_m
-        length_m = 0.0 if not trail else trail[-1][3] + math.hypot(x_m - trail[-1][1], y_m - trail[-1][2])
-        if trail and length_m - trail[-1][3] < 0.1:
+        step_m = 0.0 if last is None else math.hypot(x_m - last.x_m, y_m - last.y_m)
+        if last is not None and step_m < 0.1:
             continue  # a place every 0.1 m
-        first = next(
-            (p for p in trail if length_m - p[3] > LOOP_M and math.hypot(x_m - p[1], y_m - p[2]) < LOOP_NEAR_M), None
-        )
+        place = _Place(tick.now_ns, x_m, y_m, step_m + (0.0 if last is None else last.length_m))
+        first = _first_near(cells, place)
         if first is not None:
-            found.append(
-                Event(DETOUR, first[0], tick.now_ns, f"back at the same place after {length_m - first[3]:.1f} m")
-            )
-            trail = []
-            length_m = 0.0
-        trail.append((tick.now_ns, x_m, y_m, length_m))
+            detail = f"back at the same place after {place.length_m - first.length_m:.1f} m"
+            found.append(Event(DETOUR, first.at_ns, tick.now_ns, detail))
+            cells, place = {}, place._replace(length_m=0.0)
+        cells.setdefault(place.cell, []).append(place)
+        last = place
     return found
+
+
+def _first_near(cells: _Cells, place: _Place) -> _Place | None:
+    """Return the first place within LOOP_NEAR_M from which the path is longer than LOOP_M; None without one."""
+    column, row = place.cell
+    around = itertools.product((column - 1, column, column + 1), (row - 1, row, row + 1))
+    near = (each for cell in around for each in cells.get(cell, ()) if place.length_m - each.length_m > LOOP_M)
+    back = (each for each in near if math.hypot(place.x_m - each.x_m, place.y_m - each.y_m) < LOOP_NEAR_M)
+    return min(back, key=lambda each: each.length_m, default=None)

@@ -145,7 +145,7 @@ def _plan(tick: RecordedTick) -> str:
 
 def _command(flight: Flight, tick: RecordedTick) -> str:
     vx, vy, wz = tick.command
-    faults = ", ".join(fault.name for fault in flight.faults_at(tick.now_ns))
+    faults = ", ".join(flight.faults_at(tick.now_ns))
     limit = "" if tick.speed_scale >= 1 else f", limit {tick.speed_scale:.0%}"
     named = f"; faults: {faults}" if faults else ""
     return f"{vx:+.2f} m/s, {vy:+.2f} m/s left, {wz:+.2f} rad/s ({tick.reason}{limit}){named}"

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from edge.core.geometry import SE2
-from edge.flightlog.reader import RecordingError, read_messages
-from edge.flightlog.replay.records import RecordedGeneration, RecordedTick, read_events, read_run
+from edge.flightlog.reader import Damage, RecordingError, damage_notice, read_messages
+from edge.flightlog.replay.records import NO_TICK, RecordedGeneration, RecordedTick, read_events, read_run
 from edge.flightlog.standard_messages import Mount
 from edge.safety.faults.row import Action
 
@@ -83,6 +83,8 @@ class Flight:
     result: Mapping[str, Any] = field(default_factory=dict)
     mount: Mount | None = None
     frames_ns: Sequence[int] = ()
+    damages: Sequence[Damage] = ()
+    """Places of the log that could not be read."""
 
     def __post_init__(self) -> None:
         if not self.ticks:
@@ -114,6 +116,22 @@ class Flight:
         lines = self.result.get("faults")
         return tuple(map(str, lines)) if isinstance(lines, list) else ()
 
+    @property
+    def new_instructions(self) -> list[tuple[int, str]]:
+        """Instructions given during the run, each with the release of its first text, ns."""
+        found: list[tuple[int, str]] = []
+        now = self.instruction
+        for each in sorted(self.generations.values(), key=lambda each: each.ready_ns):
+            if each.instruction is not None and each.instruction != now:
+                now = each.instruction
+                found.append((each.ready_ns, now))
+        return found
+
+    @property
+    def notice(self) -> str | None:
+        """One line for the user about damage of the log; None for a log without."""
+        return damage_notice(self.damages, self.start_ns) if self.damages else None
+
     def seconds(self, at_ns: int) -> float:
         """Return an instant as s since the first tick."""
         return (at_ns - self.start_ns) / 1e9
@@ -135,9 +153,9 @@ class Flight:
         near = [truth for truth in self.truths[low:high] if truth.route_bearing_rad is not None]
         return min(near, key=lambda truth: abs(truth.stamp_ns - at_ns), default=None)
 
-    def faults_at(self, at_ns: int) -> list[FaultSpan]:
-        """Return the faults present at an instant."""
-        return [fault for fault in self.faults if fault.begin_ns <= at_ns <= fault.end_ns]
+    def faults_at(self, at_ns: int) -> list[str]:
+        """Return the names of the faults present at an instant, each once."""
+        return list(dict.fromkeys(fault.name for fault in self.faults if fault.begin_ns <= at_ns <= fault.end_ns))
 
     def frame_at(self, at_ns: int) -> int | None:
         """Return the stamp of the newest recorded picture at an instant, ns."""
@@ -148,7 +166,8 @@ class Flight:
 def read_flight(path: Path) -> Flight:
     """Read a flight log. Raises RecordingError for one without a run or a tick or with a malformed record, OSError."""
     run, ticks, generations, frames_ns = read_run(path), [], {}, []
-    for event in read_events(path):
+    damages: list[Damage] = []
+    for event in read_events(path, damages):
         if isinstance(event, RecordedTick):
             _check_stamps(path, "/tick", event.now_ns)
             ticks.append(event)
@@ -158,7 +177,7 @@ def read_flight(path: Path) -> Flight:
         else:
             frames_ns.append(event.stamp_ns)
     if not ticks:
-        raise RecordingError(f"{path}: holds no /tick record, the run ended before its first control tick")
+        raise RecordingError(f"{path}: {NO_TICK}")
     truths: list[Truth] = []
     faults: list[FaultSpan] = []
     result: Mapping[str, Any] = {}
@@ -176,7 +195,7 @@ def read_flight(path: Path) -> Flight:
         except _MISSHAPEN as error:
             raise RecordingError(f"{path}: a {topic} record lacks or misshapes a field ({error!r})") from error
     truths.sort(key=lambda truth: truth.stamp_ns)
-    return Flight(run.instruction, ticks, generations, faults, truths, result, mount, sorted(frames_ns))
+    return Flight(run.instruction, ticks, generations, faults, truths, result, mount, sorted(frames_ns), damages)
 
 
 def _check_stamps(path: Path, topic: str, *stamps_ns: int) -> None:

@@ -32,6 +32,8 @@ _PLAN_HALF_M: Final = 0.15
 _NEAREST_M: Final = 0.15
 """Distance before the lens from which on floor is drawn, m."""
 _STEPS: Final = 12
+_AROUND_PX: Final = tuple(shift for shift in itertools.product((-1, 0, 1), repeat=2) if shift != (0, 0))
+"""Shifts of a text that draw its edge, px. A thicker text would be wider in OpenCV 5, and its edge beside the text."""
 
 
 class Overlay:
@@ -109,7 +111,9 @@ def waypoints_seen(tick: RecordedTick | None, generation: RecordedGeneration) ->
 def label(picture: Picture, text: str, at: tuple[int, int], colour: tuple[int, int, int], scale: float = 0.45) -> None:
     """Write a text with a dark edge, readable on any picture; characters beyond ASCII become question marks."""
     shown = "".join(c if " " <= c <= "~" else "?" for c in text)
-    cv2.putText(picture, shown, at, cv2.FONT_HERSHEY_SIMPLEX, scale, (20, 20, 20), 3, cv2.LINE_AA)
+    for shift in _AROUND_PX:
+        edge_at = (at[0] + shift[0], at[1] + shift[1])
+        cv2.putText(picture, shown, edge_at, cv2.FONT_HERSHEY_SIMPLEX, scale, (20, 20, 20), 1, cv2.LINE_AA)
     cv2.putText(picture, shown, at, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, 1, cv2.LINE_AA)
 
 

@@ -105,8 +105,11 @@ def judge(flight: Flight, event: Event) -> Verdict:
 def window(event: Event) -> tuple[int, int]:
     """Return the span whose ticks decide an event, ns: from the begin of a stop on, before any other event.
 
-    The stop that only a new arming ends has no ticks after its begin.
+    The stop that only a new arming ends has no ticks after its begin. Of a stop before the first motion, the end
+    decides: its begin waits for the first text.
     """
+    if event.first:
+        return max(event.begin_ns, event.end_ns - _BEFORE_NS), event.end_ns
     if event.kind == STOP and not event.final:
         return event.begin_ns, min(event.end_ns, event.begin_ns + _BEFORE_NS)
     return event.begin_ns - _BEFORE_NS, event.begin_ns
@@ -209,6 +212,8 @@ def _wrong_way(generation: RecordedGeneration, waypoint_rad: float, route_rad: f
         onward = "still turns" if turns else "goes on"
         return f"the text ends the route too early: it plans to stop, and the path {onward}"
     if isinstance(plan.action, TurnBack):
+        if abs(route_rad) > math.pi / 2:
+            return "the text turns back, as the path does, and its waypoints lead off it"
         return "the text turns back, and the path goes on"
     if plan.action.side not in (LEFT, RIGHT):
         if not turns:
@@ -268,7 +273,7 @@ def _holder(flight: Flight, held: Sequence[RecordedTick]) -> str:
         return max(set(names), key=names.count)
     faults = flight.faults_at(held[-1].now_ns)
     if held[-1].speed_scale < 1 and faults:
-        return f"the supervisor's limit {held[-1].speed_scale:.0%} for {faults[-1].name}"
+        return f"the supervisor's limit {held[-1].speed_scale:.0%} for {faults[-1]}"
     return "the controller's limits or slew"
 
 
@@ -319,7 +324,12 @@ def _arrival(flight: Flight, event: Event) -> Verdict | None:
     held = [tick for tick in ticks if tick.reason == HELD_AT_STOP]
     if len(held) <= len(ticks) / 2:
         return None
-    truth, generation = flight.route_at(event.begin_ns), generation_of(flight, held[0])
+    return _text_stops(flight, event.begin_ns, generation_of(flight, held[0]))
+
+
+def _text_stops(flight: Flight, at_ns: int, generation: RecordedGeneration | None) -> Verdict:
+    """Judge a stop that the text plans: at the goal or before it."""
+    truth = flight.route_at(at_ns)
     lines = () if generation is None else (_line(generation.text, "Progress"), _line(generation.text, "Plan"))
     if truth is not None and truth.route_m is not None and truth.route_m > GOAL_M:
         return Verdict(REASONING, "the text ends the route before the goal", (f"{truth.route_m:.1f} m before", *lines))
@@ -344,6 +354,8 @@ def _standing_plan(flight: Flight, ticks: Sequence[RecordedTick]) -> Verdict | N
         return Verdict(REASONING, "the text waits for a person, and nobody is there", lines)
     if waits:
         return Verdict(PERSON, "the text lets a person pass", lines)
+    if parts.plan is not None and isinstance(parts.plan.action, Stop) and parts.plan.action.distance_m == 0:
+        return _text_stops(flight, tick.now_ns, generation)
     if point is None:
         left = "" if truth is None or truth.route_m is None else f"{truth.route_m:.1f} m from the goal"
         return Verdict(REASONING, "the text's waypoints stay where the robot is: it means to be there", (*lines, left))

@@ -34,6 +34,8 @@ PANEL_PX: Final = 160
 CODEC: Final = "mp4v"
 _MAX_TEXT_LINES: Final = 6
 _TEXT_CHARS: Final = 88
+_FAULT_CHARS: Final = 54
+"""Characters that fit right of the time and the delay, also in the wider letters of OpenCV 4."""
 _SINGLE_HZ: Final = 10.0
 """Rate of a video of one picture, Hz."""
 _MOST_HZ: Final = 240.0
@@ -77,13 +79,12 @@ def draw_page(overlay: Overlay, flight: Flight, frame: RecordedFrame) -> Picture
         delay = "delay --" if generation is None else f"delay {tick.delay_s:.1f} s"
         label(panel, delay, (90, 18), WAYPOINT_COLOUR, 0.5)
         vx, vy, wz = tick.command
-        label(panel, f"command {vx:+.2f} {vy:+.2f} m/s {wz:+.2f} rad/s", (190, 18), PLAN_COLOUR, 0.45)
+        label(panel, f"command {vx:+.2f} {vy:+.2f} m/s {wz:+.2f} rad/s", (8, 38), PLAN_COLOUR, 0.45)
         vx, vy, wz = tick.state
-        label(panel, f"measured {vx:+.2f} m/s {wz:+.2f}", (450, 18), (200, 200, 200), 0.45)
-        faults = ", ".join(fault.name for fault in flight.faults_at(tick.now_ns))
-        held = "" if tick.reason == "ok" else tick.reason
-        if faults or held:
-            label(panel, f"{held}  {faults}".strip()[:_TEXT_CHARS], (8, 38), (80, 80, 255), 0.45)
+        label(panel, f"measured {vx:+.2f} m/s {wz:+.2f} rad/s", (330, 38), (200, 200, 200), 0.45)
+        held = [] if tick.reason == "ok" else [tick.reason]
+        names = dict.fromkeys([*held, *flight.faults_at(tick.now_ns)])  # a fault that holds the robot is its own reason
+        label(panel, ", ".join(names)[:_FAULT_CHARS], (190, 18), (80, 80, 255), 0.45)
     text = "" if generation is None else generation.text
     lines = [part for line in text.splitlines() for part in textwrap.wrap(line, _TEXT_CHARS)]
     for number, line in enumerate(lines[:_MAX_TEXT_LINES]):
@@ -148,6 +149,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not 0 <= args.from_s < args.to_s:
         raise RecordingError(f"--from {args.from_s:g} --to {args.to_s:g}: expected 0 or more, and --to after --from")
     flight = read_flight(args.file)
+    if flight.notice is not None:
+        _print(flight.notice)
     if flight.mount is None:
         _print(
             f"{args.file}: names no camera mount, so plan and waypoints are not drawn; add [mount] to the robot file"

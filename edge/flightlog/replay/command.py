@@ -26,9 +26,9 @@ from edge.core.cli import (
     write_result,
 )
 from edge.core.stats import percentiles
-from edge.flightlog.reader import RecordingError, parts
+from edge.flightlog.reader import Damage, RecordingError, damage_notice, parts
 from edge.flightlog.replay.policy import Comparison, Replayer
-from edge.flightlog.replay.records import RecordedRun, RecordedTick, read_events, read_run
+from edge.flightlog.replay.records import NO_TICK, RecordedRun, RecordedTick, read_events, read_run
 from edge.inference import engines
 from edge.inference.warm_up import open_proven
 from firmware_bridge.system.terminal import CommandParser
@@ -103,13 +103,14 @@ def replay(path: Path, artifacts: Artifacts, run: RecordedRun, from_s: float, to
     opened = open_proven(artifacts)
     first_ns = next((event.now_ns for event in read_events(path) if isinstance(event, RecordedTick)), None)
     if first_ns is None:
-        raise RecordingError(f"{path}: holds no /tick record, the run ended before its first control tick")
+        raise RecordingError(f"{path}: {NO_TICK}")
     to_ns = first_ns + round(to_s * 1e9) if math.isfinite(to_s) else 2**63
     replayer = Replayer(
         artifacts, opened.policy, opened.language, run, from_ns=first_ns + round(from_s * 1e9), to_ns=to_ns
     )
+    damages: list[Damage] = []
     ticks, printed_ns = 0, time.monotonic_ns()
-    for event in read_events(path):
+    for event in read_events(path, damages):
         replayer.step(event)
         if isinstance(event, RecordedTick):
             ticks += 1
@@ -120,6 +121,8 @@ def replay(path: Path, artifacts: Artifacts, run: RecordedRun, from_s: float, to
                 found = replayer.comparison
                 at_s = (event.now_ns - first_ns) / 1e9
                 _print(f"at {at_s:.0f} s of the log: {found.ticks} ticks and {found.generations} generations run again")
+    if damages:
+        _print(damage_notice(damages, first_ns))
     return replayer.comparison, ticks
 
 

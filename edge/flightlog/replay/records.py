@@ -7,13 +7,13 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from edge.core.geometry import SE2
-from edge.flightlog.reader import RecordingError, jpeg_bytes, read_messages
+from edge.flightlog.reader import Damage, RecordingError, jpeg_bytes, read_messages
 from edge.reasoning.decoding_rules import FOLLOWS, FREE, DecodingContext, TurnDistances
 from edge.reasoning.path_memory import PastPath
 from edge.reasoning.prompt import format_before
@@ -90,6 +90,9 @@ class RecordedTick:
 
 
 Event = RecordedFrame | RecordedGeneration | RecordedTick
+NO_TICK: Final = (
+    "no /tick record could be read: the run ended before its first control tick, or the log is cut or damaged"
+)
 
 
 def read_run(path: Path) -> RecordedRun:
@@ -97,14 +100,19 @@ def read_run(path: Path) -> RecordedRun:
     for topic, _, payload in read_messages(path):
         if topic == "/run":
             return _read(path, "/run", _run, payload)
-    raise RecordingError(f"{path}: no /run record, so the run is unknown; expected a log of edge-run --record")
+    raise RecordingError(
+        f"{path}: no /run record could be read; expected a log of edge-run --record, not cut or damaged at its start"
+    )
 
 
-def read_events(path: Path) -> Iterator[Event]:
-    """Yield frames, generations and ticks in the order of their stamps; raises RecordingError for a malformed one."""
+def read_events(path: Path, damages: list[Damage] | None = None) -> Iterator[Event]:
+    """Yield frames, generations and ticks in the order of their stamps; raises RecordingError for a malformed one.
+
+    `damages`: see `read_messages`.
+    """
     waiting: list[tuple[int, int, Event]] = []
     newest_ns = count = 0
-    for topic, stamp_ns, payload in read_messages(path):
+    for topic, stamp_ns, payload in read_messages(path, damages):
         event: Event
         if topic == "/tick":
             event = tick = _read(path, topic, _tick, payload)

@@ -80,7 +80,7 @@ def test_a_malformed_record_is_one_line_that_names_it(
 ) -> None:
     """Whatever of it the reader of the file already refuses."""
     for module in (flight_module, records_module):
-        monkeypatch.setattr(module, "read_messages", lambda _path: iter(messages(records)))
+        monkeypatch.setattr(module, "read_messages", lambda *_: iter(messages(records)))
     assert main(tmp_path / "flight.mcap") == EXIT_BAD_INPUT
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and len(error) < 300 and f"a {topic} record" in error

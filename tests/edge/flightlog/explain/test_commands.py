@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,11 +14,14 @@ from edge import commands
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE
 from edge.core.geometry import SE2
 from edge.flightlog.explain import command, video
-from edge.flightlog.explain.overlay import PLAN_COLOUR, WAYPOINT_COLOUR, Overlay, waypoints_seen
+from edge.flightlog.explain.flight import FaultSpan
+from edge.flightlog.explain.overlay import PLAN_COLOUR, WAYPOINT_COLOUR, Overlay, label, waypoints_seen
+from edge.flightlog.replay.records import RecordedFrame
 from edge.flightlog.standard_messages import Mount
 from tests.support.html_page import assert_loads_nothing
 from tests.support.runner import explained_flights as flights
 from tests.support.runner import synthetic_run
+from tests.support.runner.explained_flights import at
 from tools.report import explain_page
 
 
@@ -53,6 +57,15 @@ def test_the_page_has_the_pictures_and_loads_nothing(log: Path, tmp_path: Path) 
     html = page.read_text()
     assert html.count("data:image/jpeg") == 4 and "decisive" in html
     assert_loads_nothing(html)
+
+
+def test_text_json_and_page_list_a_new_instruction(log: Path, tmp_path: Path) -> None:
+    flight = flights.flight(generations={5: replace(flights.generation(5), instruction="come <back>")})
+    result = command.as_result(log, flight, [])
+    assert result["new_instructions"] == [{"at_s": 10.0, "instruction": "come <back>"}]
+    assert "\ninstruction from 10.0 s: come <back>\n" in command.table(result)
+    explain_page.write_page(tmp_path / "why.html", log, flight, [])
+    assert "Instruction from 10.0 s: <b>come &lt;back&gt;</b>" in (tmp_path / "why.html").read_text()
 
 
 def test_a_video_has_every_picture_with_the_plan_drawn_in_it(log: Path, tmp_path: Path) -> None:
@@ -103,6 +116,23 @@ def test_the_plan_and_the_waypoints_are_drawn_where_the_floor_is() -> None:
 def test_waypoints_move_towards_a_robot_that_drives() -> None:
     tick = flights.tick(2.0, offset=SE2(1.0, 0.0, 0.0))
     assert waypoints_seen(tick, flights.generation(1))[0] == pytest.approx((0.5, 0.0))
+
+
+def test_the_edge_of_a_label_stays_around_its_text() -> None:
+    picture = np.full((40, 640, 3), 120, np.uint8)
+    label(picture, "command +0.50 +0.00 m/s +0.00 rad/s", (20, 25), (255, 255, 255))
+    text, edge = (np.flatnonzero(found.any(axis=(0, 2))) for found in (picture > 170, picture < 90))
+    assert abs(text.min() - edge.min()) <= 2 and abs(text.max() - edge.max()) <= 2
+
+
+def test_the_panel_names_units_and_each_fault_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    written: list[str] = []
+    monkeypatch.setattr(video, "label", lambda _panel, text, *_: written.append(text))
+    spans = [FaultSpan(name, "", at(0.0), 2**63) for name in ("camera-frozen", "too-hot", "too-hot")]
+    flight = flights.flight(ticks=lambda s: flights.tick(s, reason="camera-frozen"), faults=spans)
+    assert video.draw_page(Overlay(None), flight, RecordedFrame(at(5.0), synthetic_run.jpeg(5.0))) is not None
+    assert "camera-frozen, too-hot" in written
+    assert "measured +0.50 m/s +0.00 rad/s" in written
 
 
 def test_a_picture_that_does_not_decode_is_left_out() -> None:

@@ -143,7 +143,8 @@ def test_a_person_who_walks_into_a_standing_robot_is_the_cause() -> None:
         ("turn left into the room in 1 m", SHARP_LEFT, math.radians(30), "turns too early or too far"),
         ("turn right into the room in 1 m", SHARP_RIGHT, math.radians(-30), "turns too early or too far"),
         ("turn left into the room in 1 m", SHARP_RIGHT, math.radians(30), "turns too late"),
-        ("turn back", STRAIGHT, 1.3, "turns back"),
+        ("turn back", STRAIGHT, 1.3, "turns back, and the path goes on"),
+        ("turn back", STRAIGHT, 3.0, "turns back, as the path does, and its waypoints lead off it"),
     ],
 )
 def test_a_detour_on_waypoints_off_the_shortest_path_is_the_texts(
@@ -222,10 +223,14 @@ def test_a_stop_that_the_plan_makes_is_judged_by_the_text(plan: str, waypoints: 
 
 
 @pytest.mark.parametrize(("route_m", "cause"), [(1.0, ARRIVED), (8.0, REASONING)])
-def test_a_stop_where_the_texts_mean_to_stop_is_judged_by_the_goal(route_m: float, cause: str) -> None:
+@pytest.mark.parametrize(("reason", "plan"), [("arrived", "stop in 9 m"), ("ok", "stop now")])
+def test_a_stop_where_the_texts_mean_to_stop_is_judged_by_the_goal(
+    reason: str, plan: str, route_m: float, cause: str
+) -> None:
     flight = flights.flight(
-        ticks=lambda s: stopped(s, command=(0.0, 0.0, 0.0), reason="arrived"),
+        ticks=lambda s: stopped(s, command=(0.0, 0.0, 0.0), rows=np.zeros((3, 3)), reason=reason),
         truths=lambda s: replace(standing_truth(s), route_m=route_m),
+        texts=lambda _: TEXT.replace("stop in 9 m", plan),
     )
     assert only(flight, STOP).cause == cause
 
@@ -236,13 +241,41 @@ def test_a_robots_log_has_no_decisive_event_because_it_does_not_know_the_goal() 
     assert found and deciding(flight, found) is None
 
 
-def test_without_truth_a_flight_knows_stops_and_loops_but_no_contacts() -> None:
-    def round_trip(second: float) -> RecordedTick:
-        angle = second / 20 * 2 * np.pi
-        return flights.tick(second, pose=SE2(2 * np.sin(angle), 2 - 2 * np.cos(angle), angle))
+@pytest.mark.parametrize("pose", [SE2(1.0, 0.0, 0.0), None], ids=["odometry", "no odometry"])
+def test_a_robot_that_never_moves_stands_from_the_first_tick_on(pose: SE2 | None) -> None:
+    def still(second: float) -> RecordedTick:
+        return flights.tick(second, pose=pose, command=(0.0, 0.0, 0.0), reason="no-token" if second < 9 else "too-hot")
 
+    (found,) = explain(flights.flight(ticks=still, truths=None))
+    assert (found.event.kind, found.at_s) == (STOP, 0.0)
+    assert found.event.detail == "19.9 s, mostly too-hot; the robot never moved"
+    assert "too-hot" in found.verdict.because, "the end decides, not the wait for the first text"
+
+
+def test_a_stop_before_the_first_motion_says_so() -> None:
+    def late(second: float) -> RecordedTick:
+        return flights.tick(second, pose=SE2(SPEED_MPS * max(second - 5.0, 0.0), 0.0, 0.0))
+
+    (event,) = find_events(flights.flight(ticks=late, truths=None))
+    assert event.first and event.begin_ns == at(0.0) and event.detail.endswith("before it first moved")
+
+
+def round_trip(second: float) -> RecordedTick:
+    angle = second / 20 * 2 * np.pi
+    return flights.tick(second, pose=SE2(2 * np.sin(angle), 2 - 2 * np.cos(angle), angle))
+
+
+def test_without_truth_a_flight_knows_stops_and_loops_but_no_contacts() -> None:
     flight = flights.flight(ticks=round_trip, truths=None)
     assert [event.kind for event in find_events(flight)] == [DETOUR]
+
+
+def test_a_path_that_a_new_instruction_leads_back_is_no_detour() -> None:
+    flight = flights.flight(ticks=round_trip, truths=None)
+    new = {n: replace(each, instruction="come back" if n >= 5 else None) for n, each in flight.generations.items()}
+    flight = replace(flight, generations=new)
+    assert flight.new_instructions == [(at(10.0), "come back")]
+    assert find_events(flight) == []
 
 
 def test_a_timeout_is_explained_by_the_event_that_took_longest() -> None:
