@@ -13,6 +13,7 @@ from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, check_result_target, comman
 from edge.flightlog.explain.explanation import Explanation, deciding, explain
 from edge.flightlog.explain.flight import Flight, read_flight
 from edge.flightlog.reader import RecordingError
+from firmware_bridge.system.terminal import CommandParser
 
 EXAMPLES = """examples:
   edge-replay explain flight.mcap
@@ -29,7 +30,7 @@ PageWriter = Callable[[Path, Path, Flight, Sequence[Explanation]], None]
 
 def parser() -> argparse.ArgumentParser:
     """Command line of `edge-replay explain`."""
-    p = argparse.ArgumentParser(
+    p = CommandParser(
         "edge-replay explain",
         description=__doc__,
         epilog=EXAMPLES,

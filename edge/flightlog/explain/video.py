@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import math
 import sys
+import tempfile
 import textwrap
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -14,12 +14,21 @@ from typing import Final
 import cv2
 import numpy as np
 
-from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, command_line, messages
+from edge.core.cli import (
+    EXIT_BAD_INPUT,
+    EXIT_DONE,
+    OutputError,
+    check_result_target,
+    command_line,
+    messages,
+    named_file,
+)
 from edge.flightlog.explain.chain import generation_of
 from edge.flightlog.explain.flight import Flight, read_flight
 from edge.flightlog.explain.overlay import PLAN_COLOUR, WAYPOINT_COLOUR, Overlay, Picture, label
 from edge.flightlog.reader import RecordingError
 from edge.flightlog.replay.records import RecordedFrame, read_events
+from firmware_bridge.system.terminal import CommandParser
 
 EXAMPLES = """examples:
   edge-replay video flight.mcap --out flight.mp4
@@ -27,7 +36,7 @@ EXAMPLES = """examples:
 
 The plan is blue, the text's waypoints are orange, on a level floor: a trotting robot shifts them by some pixels.
 A log without the camera's mount shows the pictures without drawing.
-exit codes: 0 done, 2 bad arguments or input, 130 interrupted
+exit codes: 0 done, 1 the video could not be written, 2 bad arguments or input, 130 interrupted
 """
 
 PANEL_PX: Final = 160
@@ -44,7 +53,7 @@ _MOST_HZ: Final = 240.0
 
 def parser() -> argparse.ArgumentParser:
     """Command line of `edge-replay video`."""
-    p = argparse.ArgumentParser(
+    p = CommandParser(
         "edge-replay video", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     p.add_argument("file", type=Path, metavar="FILE.mcap", help="flight log of edge-run --record or of edge-bench")
@@ -95,34 +104,42 @@ def draw_page(overlay: Overlay, flight: Flight, frame: RecordedFrame) -> Picture
 def write_video(path: Path, flight: Flight, out: Path, from_s: float, to_s: float) -> tuple[int, int]:
     """Write the video, whole or not at all; return the numbers of its pictures and of those that cannot be decoded.
 
-    Raises RecordingError, OSError.
+    Raises RecordingError, OutputError.
     """
     stamps = [at_ns for at_ns in flight.frames_ns if from_s <= flight.seconds(at_ns) <= to_s]
     if not stamps:
         raise RecordingError(f"{path}: no picture between --from and --to; expected some in {len(flight.frames_ns)}")
     rate_hz = _rate_hz(path, stamps)
-    partial = out.with_name(f"{out.stem}.partial{out.suffix}")  # OpenCV takes the format from the suffix
+    # OpenCV takes the format from the suffix, follows links and reports no full disk: a folder of its own.
+    with named_file(out) as partial, tempfile.TemporaryDirectory(prefix=".video-", dir=partial.parent) as folder:
+        draft = Path(folder) / f"video{out.suffix}"
+        count = _write_draft(draft, pages(path, flight, from_s, to_s), rate_hz)
+        if count == 0:
+            raise RecordingError(f"{path}: none of the {len(stamps)} pictures between --from and --to can be decoded")
+        found = max(0, int(cv2.VideoCapture(str(draft)).get(cv2.CAP_PROP_FRAME_COUNT)))  # -1: no video at all
+        if found != count:
+            raise OutputError(f"{out}: {found} of {count} pictures could be written; is the disk full?")
+        draft.replace(partial)
+    return count, len(stamps) - count
+
+
+def _write_draft(draft: Path, drawn: Iterator[tuple[int, Picture]], rate_hz: float) -> int:
+    """Write the pages of a video and return their number. Raises OutputError."""
     writer: cv2.VideoWriter | None = None
     count = 0
     try:
-        for _, page in pages(path, flight, from_s, to_s):
+        for _, page in drawn:
             if writer is None:
                 height, width = page.shape[:2]
-                writer = cv2.VideoWriter(str(partial), cv2.VideoWriter.fourcc(*CODEC), rate_hz, (width, height))
+                writer = cv2.VideoWriter(str(draft), cv2.VideoWriter.fourcc(*CODEC), rate_hz, (width, height))
                 if not writer.isOpened():
-                    raise OSError(f"{out}: OpenCV cannot write a video here; expected a writable folder and .mp4")
+                    raise OutputError(f"OpenCV cannot write a video as {draft.suffix!r}; expected --out FILE.mp4")
             writer.write(page)
             count += 1
-        if writer is None:
-            raise RecordingError(f"{path}: none of the {len(stamps)} pictures between --from and --to can be decoded")
-        writer.release()  # writes the end of the file
-        partial.replace(out)
     finally:
         if writer is not None:
-            writer.release()
-        with contextlib.suppress(OSError):  # its error would hide the one that ended the video
-            partial.unlink(missing_ok=True)
-    return count, len(stamps) - count
+            writer.release()  # writes the end of the file
+    return count
 
 
 def _rate_hz(path: Path, stamps_ns: Sequence[int]) -> float:
@@ -148,6 +165,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     cv2.setNumThreads(1)
     if not 0 <= args.from_s < args.to_s:
         raise RecordingError(f"--from {args.from_s:g} --to {args.to_s:g}: expected 0 or more, and --to after --from")
+    check_result_target(str(args.out), "--out")
     flight = read_flight(args.file)
     if flight.notice is not None:
         _print(flight.notice)

@@ -95,6 +95,7 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
+_LONGEST_S = 1e9  # beyond every log
 _print = messages("edge-replay")
 
 
@@ -104,9 +105,14 @@ def replay(path: Path, artifacts: Artifacts, run: RecordedRun, from_s: float, to
     first_ns = next((event.now_ns for event in read_events(path) if isinstance(event, RecordedTick)), None)
     if first_ns is None:
         raise RecordingError(f"{path}: {NO_TICK}")
-    to_ns = first_ns + round(to_s * 1e9) if math.isfinite(to_s) else 2**63
+    to_ns = first_ns + round(min(to_s, _LONGEST_S) * 1e9)
     replayer = Replayer(
-        artifacts, opened.policy, opened.language, run, from_ns=first_ns + round(from_s * 1e9), to_ns=to_ns
+        artifacts,
+        opened.policy,
+        opened.language,
+        run,
+        from_ns=first_ns + round(min(from_s, _LONGEST_S) * 1e9),
+        to_ns=to_ns,
     )
     damages: list[Damage] = []
     ticks, printed_ns = 0, time.monotonic_ns()

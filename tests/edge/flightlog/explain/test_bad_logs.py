@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED
 from edge.flightlog.explain import command, video
 from edge.flightlog.explain import flight as flight_module
 from edge.flightlog.explain.overlay import Overlay
@@ -140,7 +140,7 @@ def test_pictures_at_one_instant_are_no_video(
     assert list(tmp_path.iterdir()) == [log]
 
 
-@pytest.mark.parametrize(("raised", "code"), [(KeyboardInterrupt, EXIT_INTERRUPTED), (OSError, EXIT_BAD_INPUT)])
+@pytest.mark.parametrize(("raised", "code"), [(KeyboardInterrupt, EXIT_INTERRUPTED), (OSError, EXIT_CHECK_FAILED)])
 def test_a_video_that_does_not_end_leaves_no_file(
     raised: type[BaseException], code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -157,3 +157,30 @@ def test_a_video_that_does_not_end_leaves_no_file(
     monkeypatch.setattr(Overlay, "draw", ends)
     assert filmed(log) == code
     assert list(tmp_path.iterdir()) == [log]
+
+
+def test_a_video_that_a_full_disk_has_cut_is_no_video(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """OpenCV reports no error there: what it has written is read back."""
+    log = write(tmp_path / "flight.mcap", [(k / 10, synthetic_run.jpeg(k / 10)) for k in range(5)])
+
+    def cut(draft: Path, drawn: object, rate_hz: float) -> int:
+        draft.write_bytes(b"cut")
+        return 5
+
+    monkeypatch.setattr(video, "_write_draft", cut)
+    assert filmed(log) == EXIT_CHECK_FAILED
+    assert "0 of 5 pictures could be written; is the disk full?" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == [log]
+
+
+@pytest.mark.parametrize("out", ["", "folder"])
+def test_a_video_over_a_folder_is_refused_in_one_line(
+    out: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "folder").mkdir()
+    log = write(tmp_path / "flight.mcap", [(0.0, synthetic_run.jpeg(0.0))])
+    assert video.main([str(log), "--out", out and str(tmp_path / out)]) == EXIT_BAD_INPUT
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "--out" in error and "expected a file" in error
