@@ -9,19 +9,16 @@ from __future__ import annotations
 import argparse
 import contextlib
 import errno
-import fcntl
-import hashlib
 import os
 import platform
 import re
-import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from edge.artifacts.files import ArtifactError, read_manifest_bytes
+from edge.artifacts.files import ArtifactError
 from edge.core.cli import (
     EXIT_BAD_INPUT,
     EXIT_CHECK_FAILED,
@@ -31,39 +28,48 @@ from edge.core.cli import (
     check_result_target,
     write_result,
 )
+from edge.deploy.artifact_copy import check_artifacts, plain_files, sha256_of
 from edge.deploy.pins import PinsError, pinned_steps, pins_of, wheel_extras
 from edge.deploy.releases import (
+    FOLDER,
+    LOCK,
+    MARKER,
     CommandError,
     Contents,
-    Disk,
     Home,
+    InputError,
     Release,
     ReleaseError,
+    check_owner,
+    home_argument,
+    locked,
+    read_home,
+)
+from edge.deploy.steps import (
+    Disk,
     Run,
     Step,
     check_steps,
     command_step,
+    damage_of,
+    mark_home,
+    note_step,
     plan_rollback,
-    read_home,
     record_step,
     removal_steps,
+    run_child,
     switch_step,
     uninstall_steps,
+    verify_step,
 )
 from firmware_bridge.system.input_file import open_regular
 
 HOME: Final = Path("/opt/tic-vla-edge")
 COMMANDS: Final = ("board", "rollback", "releases", "remove")
 LOG: Final = "install.log"
-LOCK: Final = "lock"
 SERVICES: Final = "tic-vla-edge-bridge tic-vla-edge-runner"
-_HASH_BYTES: Final = 1 << 20
 _EXTRAS: Final = re.compile(r"[a-z]+(,[a-z]+)*")
 Say = Callable[[str], None]
-
-
-class InputError(ReleaseError):
-    """A bad argument or file."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +129,9 @@ def add_parsers(commands: argparse._SubParsersAction[Any]) -> None:
     listing.add_argument("--json", metavar="FILE|-", help="write the list as JSON")
     remove = commands.add_parser("remove", help="undo of board: remove every release and the link")
     for parser in (board, back, listing, remove):
-        parser.add_argument("--home", type=Path, default=HOME, metavar="DIR", help=f"folder of the releases ({HOME})")
+        parser.add_argument(
+            "--home", type=home_argument, default=HOME, metavar="DIR", help=f"folder of the releases ({HOME})"
+        )
     for parser in (board, back, remove):
         parser.add_argument("--dry-run", action="store_true", help="print the steps only")
 
@@ -169,33 +177,42 @@ def _file_error(error: OSError, home: Path) -> str:
 def _run(args: argparse.Namespace, say: Say, board: Board) -> int:
     if args.command == "releases":
         check_result_target(args.json)
-        return _list(read_home(args.home), args.json, say)
+        return _list(_own_home(args), args.json, say)
     request = _request(args, board) if args.command == "board" else None
+    if request is None and not args.home.is_dir():
+        raise InputError(f"{args.home}: no such folder; install with edge-install board")
+    home = _own_home(args)
     if args.dry_run:
-        _, steps = _plan(args, request, board, read_home(args.home), _no_command)
+        _, steps = _plan(args, request, board, home, _succeed)
         for number, step in enumerate(steps, 1):
             say(f"step {number} of {len(steps)}: {step.text}")
         say("nothing was changed (--dry-run)")
         return EXIT_DONE
-    if request is None and not args.home.is_dir():
-        raise InputError(f"{args.home}: no such folder; install with edge-install board")
-    with _locked(args.home) as descriptor:
+    with locked(args.home) as descriptor:
 
         def command(words: Sequence[str]) -> tuple[int, str]:
-            return (board.run or _run_child)(descriptor, words)
+            return (board.run or run_child)(descriptor, words)
 
-        home = read_home(args.home)
+        home = _own_home(args)
+        mark_home(home, board.disk)
         unfinished, steps = _plan(args, request, board, home, command)
         _do(steps, say, board.disk, home, unfinished)
     if args.command == "remove":
-        board.disk.delete(args.home / LOG)
-        board.disk.delete(args.home / LOCK)
-        for folder in (args.home / "releases", args.home):
+        for name in (LOG, LOCK, MARKER):
+            board.disk.delete(args.home / name)
+        for folder in (args.home / FOLDER, args.home):
             with contextlib.suppress(OSError):  # something of the user's is in it
                 folder.rmdir()
         return EXIT_DONE
     _say_current(read_home(args.home), say, changed=any(step.text.startswith("switch ") for step in steps))
     return EXIT_DONE
+
+
+def _own_home(args: argparse.Namespace) -> Home:
+    """Read the releases. Raises InputError for a folder of another program."""
+    home = read_home(args.home)
+    check_owner(home, empty_allowed=args.command in ("board", "releases"))
+    return home
 
 
 def _plan(
@@ -211,18 +228,29 @@ def plan_board(home: Home, request: Request, board: Board, command: Run) -> tupl
     """Return the number of the release to make, None if it is there, and the steps to it."""
     steps = removal_steps(home, home.unfinished, "unfinished, an earlier call was cut off")
     found = home.made_from(request.contents)
+    damage = None if found is None else damage_of(home, found, command)
+    previous, damaged = home.current, None
+    if found is not None and damage is not None:
+        # In another folder: services may still run from the damaged one.
+        steps.append(note_step(f"build release {found.number} again, it is damaged: {damage}"))
+        damaged = found.number
+        previous = found.previous if damaged == home.current else home.current
+        found = None
     if found is not None and found.number == home.current:
         return None, [*steps, *removal_steps(home, home.to_prune(found.number, found.previous, request.keep), "old")]
     number = home.next_number() if found is None else found.number
-    release = Release(number, request.contents, home.current)
+    release = Release(number, request.contents, previous)
     if found is None:
         steps += build_steps(home, number, request, board, command)
-    steps += check_steps(home, number, command)
+        steps.append(verify_step(home, number, request.contents.manifest_sha256))
+        steps += check_steps(home, number, command)
     if found != release:
         steps += [Step("flush the disks", lambda disk: disk.flush()), record_step(home, release)]
     steps.append(switch_step(home, number))
-    steps += removal_steps(home, home.to_prune(number, home.current, request.keep), "old")
-    return (number if found is None else None), steps
+    if damaged is not None and damaged != home.current:
+        steps += removal_steps(home, [damaged], "damaged")
+    old = [old for old in home.to_prune(number, previous, request.keep) if old not in (home.current, damaged)]
+    return (number if found is None else None), [*steps, *removal_steps(home, old, "old")]
 
 
 def build_steps(home: Home, number: int, request: Request, board: Board, command: Run) -> list[Step]:
@@ -271,7 +299,7 @@ def _do(steps: Sequence[Step], say: Say, disk: Disk, home: Home, unfinished: int
         with contextlib.suppress(OSError):  # a full disk; the first line says what failed
             disk.write(log, output + "\n")
         raise CommandError(error.code, f"{first}; the current release is unchanged; all output: {log}") from None
-    except (OSError, KeyboardInterrupt):
+    except (ArtifactError, OSError, KeyboardInterrupt):
         _remove_unfinished(disk, home, unfinished)
         raise
 
@@ -289,9 +317,12 @@ def _list(home: Home, where: str | None, say: Say) -> int:
         extras = ",".join(contents.extras) or "no extras"
         say(f"release {release.number}: {contents.wheel} [{extras}], artifacts {contents.manifest_sha256[:12]}{mark}")
     for number in home.unfinished:
-        say(f"release {number}: unfinished; the next edge-install board removes it")
+        record = home.layout.record(number)
+        what = f"damaged, {record} cannot be read" if os.path.lexists(record) else "unfinished"
+        say(f"release {number}: {what}; the next edge-install board removes it")
     if home.find(home.current) is None:
-        say(f"{home.layout.link}: no complete release is current")
+        reason = "" if home.current is None else f": {home.layout.record(home.current)} cannot be read"
+        say(f"{home.layout.link}: no complete release is current{reason}; make one with edge-install board")
     numbers = [release.number for release in home.releases]
     write_result(where, {"current": home.current, "releases": numbers, "unfinished": list(home.unfinished)})
     return EXIT_DONE if home.find(home.current) is not None else EXIT_CHECK_FAILED
@@ -314,7 +345,10 @@ def _request(args: argparse.Namespace, board: Board) -> Request:
         raise InputError(f"--keep {args.keep}: expected at least 1: the release to roll back to")
     extras = tuple(sorted(set(args.extras.split(",")))) if args.extras else ()
     artifacts = args.artifacts.absolute()
-    manifest = read_manifest_bytes(artifacts)
+    try:
+        manifest_sha256 = check_artifacts(artifacts)
+    except ArtifactError as error:
+        raise ArtifactError(f"{error}; copy or export the artifacts again") from error
     options: list[str] = []
     if args.wheels is not None:
         options += ["--no-index", "--find-links", _existing("--wheels", args.wheels, Path.is_dir)]
@@ -330,10 +364,8 @@ def _request(args: argparse.Namespace, board: Board) -> Request:
     return Request(
         wheel=wheel,
         artifacts=artifacts,
-        files=tuple(sorted(path for path in artifacts.iterdir() if path.is_file())),
-        contents=Contents(
-            wheel.name, _digest(wheel), hashlib.sha256(manifest).hexdigest(), extras, tuple(args.requirements)
-        ),
+        files=plain_files(artifacts),
+        contents=Contents(wheel.name, _digest(wheel), manifest_sha256, extras, tuple(args.requirements)),
         pip_options=tuple(options),
         keep=args.keep,
         pins=pins,
@@ -349,45 +381,10 @@ def _existing(option: str, path: Path, is_right: Callable[[Path], bool]) -> str:
 
 
 def _digest(path: Path) -> str:
-    digest = hashlib.sha256()
     with open_regular(path) as file:
-        while block := file.read(_HASH_BYTES):
-            digest.update(block)
-    return digest.hexdigest()
+        return sha256_of(file)
 
 
-@contextlib.contextmanager
-def _locked(home: Path) -> Iterator[int]:
-    """Yield the descriptor of a lock on the releases; raises ReleaseError if another call has it."""
-    home.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(home / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(descriptor)
-        raise ReleaseError(f"{home / LOCK}: another edge-install, or a pip that it started, works here; wait") from None
-    try:
-        yield descriptor
-    finally:
-        os.close(descriptor)
-
-
-def _run_child(lock: int, words: Sequence[str]) -> tuple[int, str]:
-    """Run a command; returns its exit code and output.
-
-    The child keeps the lock: if this process is killed, the next call waits for a pip that still writes.
-    """
-    done = subprocess.run(
-        list(words), env=_environment(os.environ), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT, text=True, errors="replace", check=False, pass_fds=(lock,),
-    )  # fmt: skip
-    return done.returncode, done.stdout
-
-
-def _environment(given: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment without what would let a new release read packages of another."""
-    return {name: value for name, value in given.items() if name not in ("PYTHONPATH", "PYTHONHOME", "PIP_TARGET")}
-
-
-def _no_command(words: Sequence[str]) -> tuple[int, str]:
-    raise AssertionError(f"a dry run has run {words}")
+def _succeed(_words: Sequence[str]) -> tuple[int, str]:
+    """Stand for every program in a dry run, which starts none."""
+    return 0, ""

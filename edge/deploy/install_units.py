@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from ipaddress import IPv4Network
 from pathlib import Path
-from stat import S_IROTH, S_IXOTH
 from typing import Any, Final
 
 import psutil
@@ -22,11 +21,12 @@ from edge.artifacts.manifest import Artifacts, load_artifacts
 from edge.artifacts.providers import device_nodes
 from edge.artifacts.target_facts import TargetFacts, target_facts
 from edge.artifacts.trust import STATE_DIRECTORY, Trust
-from edge.core.cli import EXIT_CHECK_FAILED, EXIT_DONE, write_result, write_whole
+from edge.core.cli import EXIT_CHECK_FAILED, EXIT_DONE, write_result
 from edge.deploy import units
 from edge.deploy.link_rights import Addresses, link_rights, robot_networks
-from edge.deploy.releases import LINK
+from edge.deploy.releases import LINK, home_argument
 from edge.deploy.unit_check import MAX_EXPOSURE, UnitVerdict, check_units, systemd_version
+from edge.deploy.unit_files import check_writers, unreadable, write_units
 from edge.deploy.unit_text import (
     BRIDGE_USER,
     OPERATOR_GROUP,
@@ -42,6 +42,7 @@ from edge.run.instructions import check_first_instruction
 from firmware_bridge.core.config import RobotConfig, load_robot_config
 from firmware_bridge.system.input_file import read_text
 
+PROGRAMS: Final = ("edge-bridge", "edge-run")
 SYSTEM_UNITS: Final = Path("etc/systemd/system")
 SYSTEM_USERS: Final = Path("etc/sysusers.d")
 SYSTEM_RULES: Final = units.FIREWALL_FOLDER.relative_to("/")
@@ -89,7 +90,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     place.add_argument("--out", type=Path, metavar="DIR", help="write the files here, to be read or copied")
     place.add_argument("--system", action="store_true", help="write them to where systemd reads them (needs root)")
     parser.add_argument(
-        "--home", type=Path, metavar="DIR",
+        "--home", type=home_argument, metavar="DIR",
         help="run the release that DIR/current leads to (edge-install board), instead of this installation",
     )  # fmt: skip
     parser.add_argument("--target", metavar="NAME", help="refuse artifacts of any other target")
@@ -142,6 +143,7 @@ def run(args: argparse.Namespace, say: Callable[[str], None], host: Host | None 
         say(f"{inputs.engines}: not there yet; build it before the runner starts: edge-install engines")
     if inputs.operator_arm and args.arm_at_start:
         say(f"{inputs.robot}: has operator_arm, so --arm-at-start changes nothing: the bridge waits for an operator")
+    check_writers([*needed, *(inputs.programs / name for name in PROGRAMS)])
     closed = unreadable(needed)
     for path in closed:
         say(f"{path}: the services cannot read it unless it is theirs: chmod o+rX {shlex.quote(str(path))}")
@@ -150,7 +152,7 @@ def run(args: argparse.Namespace, say: Callable[[str], None], host: Host | None 
         say(f"{secret}: only the bridge may read it: sudo chown {user}: {key} && sudo chmod 0600 {key}")
     _report_firewall(inputs, say)
     contents = _contents(args, inputs, host)
-    written = _write(contents, force=args.force)
+    written = write_units(contents, force=args.force)
     for path in contents:
         say(f"{path}: {'written' if path in written else 'is up to date'}")
     verdict = host.check([path for path in contents if path.suffix == ".service"])
@@ -213,7 +215,7 @@ def gather(args: argparse.Namespace, host: Host) -> units.ServiceInputs:
         raise ArtifactError(
             f"{artifacts.directory}: made for {artifacts.target}, expected {args.target}; export for {args.target}"
         )
-    for program in ("edge-bridge", "edge-run"):
+    for program in PROGRAMS:
         if not (host.programs / program).exists():
             raise UnitError(f"{host.programs / program}: missing; install the package there: pip install tic-vla-edge")
     dds = robot.dds
@@ -257,20 +259,6 @@ def _robot_files(robot: RobotConfig) -> tuple[Path, ...]:
     """Return the files outside the package that the robot file names, without the bridge's secret."""
     files = (robot.odometry.calibration, robot.safety.estop_file, None if robot.can is None else robot.can.dbc)
     return tuple(path for path in files if path is not None and path.is_absolute())
-
-
-def unreadable(paths: Sequence[Path]) -> list[Path]:
-    """Return those of these paths and their parents that other users cannot read."""
-    closed: list[Path] = []
-    for path in paths:
-        # Files below hidden folders are bound directly, without their parents.
-        way = (
-            [] if units.is_hidden(path) else [folder for folder in path.parents if not folder.stat().st_mode & S_IXOTH]
-        )
-        inside = sorted(path.iterdir()) if path.is_dir() else []
-        needs = {path: S_IROTH | S_IXOTH if path.is_dir() else S_IROTH, **dict.fromkeys(inside, S_IROTH)}
-        closed += [*way, *(entry for entry, bits in needs.items() if entry.stat().st_mode & bits != bits)]
-    return list(dict.fromkeys(closed))
 
 
 def _instruction(args: argparse.Namespace) -> str:
@@ -321,25 +309,6 @@ def _report_firewall(inputs: units.ServiceInputs, say: Callable[[str], None]) ->
             f"the firewall lets {', '.join(map(str, wide))} through: give the robot's own address with --network, e.g. "
             f"192.168.123.161/32, to let only the robot through"
         )
-
-
-def _write(contents: Mapping[Path, str], *, force: bool) -> list[Path]:
-    """Write the files that differ, each in one rename; refuse before the first if a path is not replaceable."""
-    wanted: dict[Path, str] = {}
-    for path, text in contents.items():
-        if path.is_symlink() or (path.exists() and not path.is_file()):
-            raise UnitError(f"{path}: is no plain file; remove it first")
-        if path.exists() and path.read_text(encoding="utf-8", errors="replace") == text:
-            continue
-        if path.exists() and not force:
-            raise UnitError(f"{path}: exists and differs; replace it with --force")
-        wanted[path] = text
-    for path, text in wanted.items():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, text)
-        # systemd complains about world-writable units and needs world-readable ones.
-        path.chmod(0o644)
-    return list(wanted)
 
 
 def _report(verdict: UnitVerdict, say: Callable[[str], None]) -> None:

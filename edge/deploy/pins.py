@@ -16,7 +16,7 @@ from email.parser import Parser
 from pathlib import Path
 from typing import Final
 
-from edge.deploy.releases import Run, Step, command_step
+from edge.deploy.steps import Run, Step, command_step
 from firmware_bridge.system.input_file import open_regular
 
 FILE: Final = "edge/deploy/constraints-hashed.txt"
@@ -25,6 +25,9 @@ PLATFORMS: Final = "# platforms: "
 EXTRAS: Final = "# extras: "
 BASE: Final = "base"
 _MAX_BYTES: Final = 1_000_000
+"""Largest text file that is read from a wheel, bytes: its pins have 0.2 MB."""
+_MAX_UNPACKED: Final = 200_000_000
+"""Largest wheel once unpacked, bytes: a small file may expand to gigabytes. Ours has a few MB."""
 _DAMAGED: Final = (zipfile.BadZipFile, EOFError, zlib.error, lzma.LZMAError, UnicodeDecodeError, RuntimeError)
 """Errors of a zip file that is cut, damaged, encrypted or compressed by a method that wheels do not have."""
 
@@ -116,8 +119,14 @@ def wheel_extras(wheel: Path) -> frozenset[str]:
     """Return the extras of this package's wheel. Raises PinsError for another file, or for a part of one."""
     try:
         with open_regular(wheel) as file, zipfile.ZipFile(file) as archive:
-            broken = archive.testzip()
             names = [name for name in archive.namelist() if name.endswith(".dist-info/METADATA")]
+            unpacked = sum(entry.file_size for entry in archive.infolist())
+            if unpacked > _MAX_UNPACKED or any(archive.getinfo(name).file_size > _MAX_BYTES for name in names):
+                raise PinsError(
+                    f"{wheel}: {unpacked} bytes once unpacked, expected at most {_MAX_UNPACKED}, and {_MAX_BYTES} of "
+                    f"METADATA; build the wheel again"
+                )
+            broken = archive.testzip()
             if broken is not None or not names:
                 raise PinsError(f"{wheel}: not a whole wheel ({broken or 'no METADATA'}); copy it again")
             metadata = Parser().parsestr(archive.read(names[0]).decode())

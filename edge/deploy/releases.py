@@ -7,41 +7,33 @@ Numbers order the releases, never times: a board without a clock battery boots i
 
 from __future__ import annotations
 
+import argparse
+import contextlib
+import fcntl
 import json
 import os
-import shlex
-import shutil
-import stat
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from edge.core.cli import write_whole
-from edge.deploy.dds_binding import explained
 from firmware_bridge.system.input_file import read_json
 
 RECORD: Final = "release.json"
 LINK: Final = "current"
 PARTIAL_LINK: Final = "current.partial"
 FOLDER: Final = "releases"
-_COPY_BYTES: Final = 1 << 20
-
-
-_ADVICE: Final = {
-    "ensurepip is not available": "sudo apt-get install python3-venv, then run this again",
-    "certificate is not yet valid": "the clock is wrong: set it (timedatectl), or install offline with --wheels DIR",
-    "No module named 'onnxruntime'": "no ONNX Runtime: give --extras cpu, or on a Jetson --with onnxruntime-gpu",
-    "libraries are missing or do not load": "on a Jetson: sudo apt-get install nvidia-jetpack, then run this again",
-    "does not match the hash": "the wheel or the index is not the expected one",
-}
-"""What to do about an error line of pip, venv or a check; `dds_binding.explained` knows the compilers'."""
-
-Run = Callable[[Sequence[str]], tuple[int, str]]
+LOCK: Final = "lock"
+MARKER: Final = ".tic-vla-edge-home"
+"""File that marks a folder as made by `edge-install board`: nothing is removed from another folder."""
 
 
 class ReleaseError(RuntimeError):
     """A release cannot be made, found or used; its text is the one line to show."""
+
+
+class InputError(ReleaseError):
+    """A bad argument or file."""
 
 
 class CommandError(ReleaseError):
@@ -118,7 +110,7 @@ class Home:
     releases: tuple[Release, ...]
     """Complete ones by rising number."""
     unfinished: tuple[int, ...]
-    """Folders without a record: an install, or a removal, that was cut off."""
+    """Entries without a record that can be read: an install, or a removal, that was cut off, or damage."""
     current: int | None
 
     def find(self, number: int | None) -> Release | None:
@@ -138,6 +130,8 @@ class Home:
     def rollback_target(self, to: int | None) -> Release:
         """Return the release to go back to: `to`, else the one before the current one. Raises ReleaseError."""
         known = ", ".join(str(release.number) for release in self.releases) or "none"
+        if to is not None and to in self.unfinished:
+            raise ReleaseError(f"--to {to}: {self.layout.record(to)} cannot be read; there are: {known}")
         if to is not None:
             found = self.find(to)
             if found is None:
@@ -165,13 +159,16 @@ def read_home(path: Path) -> Home:
     """Read which releases there are and which is current. Raises ReleaseError for a `current` that is not ours."""
     layout = Layout(path)
     folder = path / FOLDER
+    if folder.is_symlink():
+        raise ReleaseError(f"{folder}: expected a folder, found a link; name the folder above its target with --home")
     entries = folder.iterdir() if folder.is_dir() else ()
-    numbers = sorted(int(entry.name) for entry in entries if entry.name.isdecimal() and entry.name.isascii())
+    numbers = sorted(number for entry in entries if (number := _number(entry.name)) is not None)
     current = _current(layout)
     releases = []
     unfinished = []
     for number in numbers:
-        release = _read_record(layout.record(number), number)
+        # A link in place of a folder leads to files that are not ours.
+        release = None if layout.folder(number).is_symlink() else _read_record(layout.record(number), number)
         if release is not None:
             releases.append(release)
         elif number != current:  # what the link leads to is never removed, whatever its record says
@@ -185,9 +182,40 @@ def _current(layout: Layout) -> int | None:
             raise ReleaseError(f"{layout.link}: expected a link to a release, found something else; move it away")
         return None
     target = layout.link.readlink()
-    if target.parent != Path(FOLDER) or not target.name.isdecimal():
+    number = _number(target.name)
+    if target.parent != Path(FOLDER) or number is None:
         raise ReleaseError(f"{layout.link}: expected a link to {FOLDER}/NUMBER, found {target}; remove the link")
-    return int(target.name)
+    return number
+
+
+def _number(name: str) -> int | None:
+    """Return the number of a release's folder; None for a name that no release has."""
+    return int(name) if name.isascii() and name.isdecimal() and str(int(name)) == name else None
+
+
+def home_argument(text: str) -> Path:
+    """Parse --home. Raises ArgumentTypeError for an empty path, which would be the working directory."""
+    if not text:
+        raise argparse.ArgumentTypeError("expected a folder, found an empty path")
+    return Path(text)
+
+
+def check_owner(home: Home, *, empty_allowed: bool) -> None:
+    """Raise InputError for a folder that `edge-install board` did not make.
+
+    Earlier versions left no marker: a release is proof. `empty_allowed`: accept also an absent or an empty folder.
+    """
+    path, current = home.layout.home, home.current
+    if (path / MARKER).is_file() or home.releases:
+        return
+    if current is not None and Path(home.layout.program(current, "edge-install")).exists():
+        return
+    others = sorted(entry.name for entry in path.iterdir() if entry.name != LOCK) if path.is_dir() else []
+    if others or not empty_allowed:
+        raise InputError(
+            f"--home {path}: expected a folder that edge-install board made, found no release, and "
+            f"{others[0] if others else 'no file'} in it; nothing was changed; name another folder"
+        )
 
 
 def _read_record(path: Path, number: int) -> Release | None:
@@ -201,135 +229,21 @@ def _read_record(path: Path, number: int) -> Release | None:
         )  # fmt: skip
         previous = found["previous"]
         return Release(number, contents, None if previous is None else int(previous))
-    except (FileNotFoundError, NotADirectoryError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, OverflowError):
         return None
 
 
-class Disk:
-    """The actions on files that make, switch and remove releases; each returns once it would survive a power cut.
-
-    Only `copy` leaves its bytes to `flush`, which a plan calls before it writes a record.
-    """
-
-    def make_folder(self, path: Path) -> None:
-        """Make a folder and those above it."""
-        path.mkdir(parents=True, exist_ok=True)
-
-    def copy(self, source: Path, target: Path) -> None:
-        """Copy a file, readable by every user."""
-        with source.open("rb") as reader, target.open("xb") as writer:
-            shutil.copyfileobj(reader, writer, _COPY_BYTES)
-        target.chmod(stat.S_IRUSR | stat.S_IWUSR | stat.S_IRGRP | stat.S_IROTH)
-
-    def flush(self) -> None:
-        """Write everything that the kernel still keeps in memory to the disks: thousands of files of an environment."""
-        os.sync()
-
-    def write(self, path: Path, text: str) -> None:
-        """Write a file in one rename."""
-        write_whole(path, text)
-        sync_folder(path.parent)
-
-    def point(self, link: Path, target: Path) -> None:
-        """Let a link lead to `target` in one rename: at every instant it leads to the old or to the new one."""
-        partial = link.with_name(PARTIAL_LINK)
-        partial.unlink(missing_ok=True)
-        partial.symlink_to(target)
-        partial.replace(link)
-        sync_folder(link.parent)
-
-    def delete(self, path: Path) -> None:
-        """Delete a file or a link, if it is there."""
-        path.unlink(missing_ok=True)
-        if path.parent.is_dir():
-            sync_folder(path.parent)
-
-    def remove_tree(self, path: Path) -> None:
-        """Remove a folder with everything in it, if it is there."""
-        if path.exists():
-            shutil.rmtree(path)
-
-
-def sync_folder(path: Path) -> None:
-    """Wait until the names in a folder are on the disk."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+@contextlib.contextmanager
+def locked(home: Path) -> Iterator[int]:
+    """Yield the descriptor of a lock on the releases; raises ReleaseError if another call has it."""
+    home.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(home / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
     try:
-        os.fsync(descriptor)
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        raise ReleaseError(f"{home / LOCK}: another edge-install, or a pip that it started, works here; wait") from None
+    try:
+        yield descriptor
     finally:
         os.close(descriptor)
-
-
-@dataclass(frozen=True)
-class Step:
-    """One step of a plan: what is printed, and what is done."""
-
-    text: str
-    act: Callable[[Disk], None]
-
-
-def switch_step(home: Home, number: int) -> Step:
-    """Make a release the current one."""
-    link, target = home.layout.link, Path(FOLDER) / str(number)
-    return Step(f"switch {link} to {target}", lambda disk: disk.point(link, target))
-
-
-def check_steps(home: Home, number: int, command: Run) -> list[Step]:
-    """Return the checks that a release has to pass before it becomes current: its own programs start."""
-    layout = home.layout
-    checks = (
-        [layout.program(number, "python"), "-I", "-c", "import onnxruntime"],
-        [layout.program(number, "edge-run"), "--help"],
-        [layout.program(number, "edge-bridge"), "--help"],
-    )
-    return [command_step("check", words, command) for words in checks]
-
-
-def command_step(text: str, words: Sequence[str], command: Run) -> Step:
-    """Run a command; a failure is a CommandError that says what to do about it."""
-
-    def act(_disk: Disk) -> None:
-        code, output = command(words)
-        if code != 0:
-            advice = next((advice for sign, advice in _ADVICE.items() if sign in output), None) or explained(output)
-            raise CommandError(code, f"cannot {text}: {advice}\n{output.rstrip()}")
-
-    return Step(f"{text}: {shlex.join(words)}", act)
-
-
-def record_step(home: Home, release: Release) -> Step:
-    """Declare a release complete."""
-    path = home.layout.record(release.number)
-    return Step(f"write {path}: release {release.number} is complete", lambda disk: disk.write(path, release.text()))
-
-
-def removal_steps(home: Home, numbers: Iterable[int], reason: str) -> list[Step]:
-    """Remove releases; the record first, so that a removal that is cut off leaves an unfinished release."""
-    return [_removal(home.layout, number, reason) for number in numbers]
-
-
-def _removal(layout: Layout, number: int, reason: str) -> Step:
-    def act(disk: Disk) -> None:
-        disk.delete(layout.record(number))
-        disk.remove_tree(layout.folder(number))
-
-    return Step(f"remove {layout.folder(number)}: {reason}", act)
-
-
-def uninstall_steps(home: Home) -> list[Step]:
-    """Remove the link and every release: the undo of `edge-install board`."""
-    layout = home.layout
-    steps = []
-    if home.current is not None:
-        steps.append(Step(f"remove {layout.link}: nothing is current", lambda disk: disk.delete(layout.link)))
-    numbers = {*(release.number for release in home.releases), *home.unfinished}
-    if home.current is not None and layout.folder(home.current).is_dir():
-        numbers.add(home.current)
-    return [*steps, *removal_steps(home, sorted(numbers), "undo of edge-install board")]
-
-
-def plan_rollback(home: Home, to: int | None, command: Run) -> list[Step]:
-    """Return the steps to another release that is there; none if it is the current one. Raises ReleaseError."""
-    target = home.rollback_target(to).number
-    if target == home.current:
-        return []
-    return [*check_steps(home, target, command), switch_step(home, target)]

@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_REFUSED
 from edge.deploy.board import Board
 from edge.deploy.install import main
-from edge.deploy.releases import Contents, Disk, Home, Layout, Release, ReleaseError, read_home
+from edge.deploy.releases import Contents, Home, Layout, Release, ReleaseError, read_home
+from edge.deploy.steps import Disk
 from tests.support.fake_board import (
     Versions,
     commands_of,
@@ -249,20 +250,6 @@ def test_a_second_call_at_the_same_time_is_refused(installed: Versions) -> None:
         assert "another edge-install" in installed.lines[-1]
     finally:
         lock.communicate(b"\n")
-
-
-def test_a_link_that_is_not_ours_is_left_alone(versions: Versions) -> None:
-    versions.home.mkdir()
-    (versions.home / "current").symlink_to("/usr")
-    assert versions.install(1) == EXIT_CHECK_FAILED
-    assert (versions.home / "current").readlink() == Path("/usr")
-
-
-def test_the_current_release_is_never_cleaned_up_even_if_its_record_is_broken(versions: Versions) -> None:
-    versions.install(1)
-    (versions.home / "releases/1/release.json").write_text("{")
-    assert versions.install(2) == EXIT_DONE
-    assert versions.numbers() == [1, 2] and current(versions.home) == 2
 
 
 # --- rollback, releases, remove

@@ -25,7 +25,8 @@ import pytest
 
 from edge.core.cli import EXIT_CHECK_FAILED, EXIT_DONE
 from edge.deploy.board import Board
-from edge.deploy.releases import Disk, read_home
+from edge.deploy.releases import read_home
+from edge.deploy.steps import Disk
 from tests.support.fake_board import Versions, current, starts
 from tests.support.processes import REPOSITORY
 

@@ -14,7 +14,7 @@ import pytest
 from edge.artifacts.files import seal
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_REFUSED
 from edge.deploy.install import main
-from edge.deploy.install_units import Host, robot_networks, unreadable
+from edge.deploy.install_units import Host, robot_networks
 from edge.deploy.unit_check import UnitVerdict
 from edge.deploy.unit_text import SYSUSERS_FILE, UnitError
 from edge.deploy.units import BRIDGE_UNIT, FIREWALL_FILE, FIREWALL_UNIT, RUNNER_UNIT, SOCKET
@@ -144,6 +144,17 @@ def test_with_consent_it_is_written_and_not_enabled_at_boot(units: Units, alone:
     assert not any("enable" in command and RUNNER_UNIT in command for command in result["commands"])
     text = (tmp_path / "units" / RUNNER_UNIT).read_text()
     assert "# --arm-at-start was given: " in text and "--require-operator" not in text
+
+
+def test_a_robot_file_or_a_home_that_every_user_may_change_is_refused(
+    units: Units, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for path, mode in ((tmp_path / "go2.toml", 0o666), (tmp_path / "bin", 0o777)):
+        before = path.stat().st_mode & 0o777
+        path.chmod(mode)
+        assert units() == (EXIT_BAD_INPUT, None)
+        assert f"chmod o-w {path}" in capsys.readouterr().err and not (tmp_path / "units").exists()
+        path.chmod(before)
 
 
 def test_useless_consent_is_reported(units: Units, capsys: pytest.CaptureFixture[str]) -> None:
@@ -326,28 +337,6 @@ def make_nodes(root: Path, names: Sequence[str]) -> None:
     for name in names:
         (root / "dev" / name).parent.mkdir(parents=True, exist_ok=True)
         (root / "dev" / name).touch()
-
-
-def test_files_that_the_services_user_cannot_read_are_named(tmp_path: Path) -> None:
-    folder = tmp_path / "artifacts"
-    folder.mkdir(mode=0o755)
-    for name, mode in (("graph.onnx", 0o600), ("manifest.json", 0o644)):
-        (folder / name).touch()
-        (folder / name).chmod(mode)
-    assert unreadable([folder]) == [folder / "graph.onnx"]
-    folder.chmod(0o700)
-    assert unreadable([folder, folder]) == [folder, folder / "graph.onnx"]
-
-
-def test_the_way_to_a_file_counts_where_the_services_see_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "closed").mkdir(mode=0o700)
-    robot = tmp_path / "closed" / "robot.toml"
-    robot.touch()
-    robot.chmod(0o644)
-    monkeypatch.setattr("edge.deploy.units.HIDDEN", (str(tmp_path),))
-    assert unreadable([robot]) == []
-    monkeypatch.setattr("edge.deploy.units.HIDDEN", ())
-    assert tmp_path / "closed" in unreadable([robot])
 
 
 def networks(dds: DdsConfig, *given: str) -> list[str]:

@@ -62,6 +62,14 @@ def test_a_damaged_wheel_is_refused(damage: str, tmp_path: Path) -> None:
         wheel_extras(wheel)
 
 
+def test_a_wheel_that_expands_to_far_more_than_a_wheel_has_is_refused_unread(tmp_path: Path) -> None:
+    wheel = tmp_path / "x.whl"
+    with zipfile.ZipFile(wheel, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("x.dist-info/METADATA", b"Name: tic-vla-edge\n" + bytes(2_000_000))
+    with pytest.raises(PinsError, match="once unpacked"):
+        wheel_extras(wheel)
+
+
 def test_pip_installs_pins_by_hash_and_resolves_nothing_itself(tmp_path: Path) -> None:
     ran: list[list[str]] = []
 

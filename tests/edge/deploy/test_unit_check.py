@@ -1,16 +1,19 @@
-"""What systemd itself says of the units: which keys it knows, how exposed a service is, which users it makes."""
+"""What systemd itself says of the units: keys, exposure, users; and the rights and the writing of the units' files."""
 
 from __future__ import annotations
 
+import errno
 import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
 
+from edge.core.cli import OutputError
 from edge.core.device import CUDA
 from edge.deploy.unit_check import MAX_EXPOSURE, UnitVerdict, check_units, systemd_version
-from edge.deploy.unit_text import ServiceUsers, sysusers
+from edge.deploy.unit_files import check_writers, unreadable, write_units
+from edge.deploy.unit_text import ServiceUsers, UnitError, sysusers
 from edge.deploy.units import (
     BRIDGE_UNIT,
     FIREWALL_UNIT,
@@ -144,3 +147,53 @@ def test_systemd_makes_the_users_apart_from_each_other(tmp_path: Path) -> None:
     groups = {line.split(":")[0]: line.split(":")[3] for line in (tmp_path / "etc/group").read_text().splitlines()}
     assert users["tic-vla-bridge"] != users["tic-vla-runner"]
     assert groups["tic-vla-operators"] == groups["tic-vla-runner"] == ""
+
+
+# --- the files that the services read, and those of the units
+
+
+def test_files_that_the_services_user_cannot_read_are_named(tmp_path: Path) -> None:
+    folder = tmp_path / "artifacts"
+    folder.mkdir(mode=0o755)
+    for name, mode in (("graph.onnx", 0o600), ("manifest.json", 0o644)):
+        (folder / name).touch()
+        (folder / name).chmod(mode)
+    assert unreadable([folder]) == [folder / "graph.onnx"]
+    folder.chmod(0o700)
+    assert unreadable([folder, folder]) == [folder, folder / "graph.onnx"]
+
+
+def test_the_way_to_a_file_counts_where_the_services_see_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "closed").mkdir(mode=0o700)
+    robot = tmp_path / "closed" / "robot.toml"
+    robot.touch()
+    robot.chmod(0o644)
+    monkeypatch.setattr("edge.deploy.units.HIDDEN", (str(tmp_path),))
+    assert unreadable([robot]) == []
+    monkeypatch.setattr("edge.deploy.units.HIDDEN", ())
+    assert tmp_path / "closed" in unreadable([robot])
+
+
+def test_a_sticky_folder_lets_only_the_owner_replace_a_file(tmp_path: Path) -> None:
+    robot = tmp_path / "robot.toml"
+    robot.touch(0o644)
+    tmp_path.chmod(0o1777)
+    check_writers([robot])
+    tmp_path.chmod(0o777)
+    with pytest.raises(UnitError, match="found mode 0777"):
+        check_writers([robot])
+
+
+def test_a_full_disk_leaves_every_unit_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = tmp_path / "first.service", tmp_path / "second.service"
+    first.write_text("old")
+
+    def write(path: Path, text: str) -> None:
+        if path.name.startswith("second"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        path.write_text(text)
+
+    monkeypatch.setattr("edge.deploy.unit_files.write_whole", write)
+    with pytest.raises(OutputError, match=r"second\.service: No space left on device; no file was changed"):
+        write_units({first: "new", second: "new"}, force=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["first.service"] and first.read_text() == "old"
