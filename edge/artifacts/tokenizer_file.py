@@ -61,6 +61,8 @@ def check_tokenizer_file(content: bytes, special: Mapping[str, int]) -> int:
     for key in ("truncation", "padding"):
         _require(found.get(key) is None, f"{key} must be null: it changes the length of a prompt")
     _require(not model.get("dropout"), "model.dropout must be null: it makes tokens random")
+    prefix = model.get("continuing_subword_prefix")
+    _require(not prefix, "model.continuing_subword_prefix must be empty: the library ends its merges with a panic")
     for section, kinds in PARTS.items():
         _check_section(section, kinds, found.get(section))
     ids = _vocabulary(model["vocab"])

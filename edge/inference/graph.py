@@ -180,6 +180,11 @@ class Graph:
             actual = [(t.name, _ORT_TYPES.get(t.type, t.type), tuple(t.shape)) for t in found]
             if promised != actual:
                 raise ArtifactError(f"{contract.file}: its inputs or outputs are not those of the manifest")
+            for tensor in declared:
+                if tensor.dtype not in DTYPES:
+                    raise ArtifactError(
+                        f"{contract.file}: {tensor.name} is {tensor.dtype}, expected one of {', '.join(DTYPES)}"
+                    )
         self.input_names = [t.name for t in contract.inputs]
         self.output_names = [t.name for t in contract.outputs]
 

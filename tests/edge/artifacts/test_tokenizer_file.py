@@ -45,6 +45,10 @@ REFUSED: dict[str, tuple[Edit, str]] = {
     "a decoder that expands": (lambda t: t.update(decoder=REPLACE), "decoder 'Replace' is not one"),
     "padding": (lambda t: t.update(padding={"strategy": {"Fixed": 10**9}}), "padding must be null"),
     "truncation": (lambda t: t.update(truncation={"max_length": 3}), "truncation must be null"),
+    "subword prefix": (
+        lambda t: t["model"].update(continuing_subword_prefix="##"),
+        "continuing_subword_prefix must be empty",
+    ),
     "dropout": (lambda t: t["model"].update(dropout=0.5), "dropout must be null"),
     "two tokens of one id": (lambda t: t["model"]["vocab"].update({"!": 7, "@": 7}), "two tokens have the same id"),
     "a negative id": (lambda t: t["model"]["vocab"].update({"!": -7}), "a token's id is out of range"),

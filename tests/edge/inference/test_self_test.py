@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -16,7 +17,9 @@ import pytest
 from onnx import TensorProto, helper
 
 from edge.artifacts.files import ArtifactError
+from edge.artifacts.known_answers import SUMS, VOCABULARY
 from edge.artifacts.manifest import Artifacts, load_artifacts
+from edge.inference import self_test
 from edge.inference.language import LanguageModel
 from edge.inference.policy import Policy
 from edge.inference.self_test import check_answers
@@ -30,6 +33,10 @@ Damage = Callable[[Path], object]
 @pytest.fixture
 def copy(artifacts_dir: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))
+
+
+def opened(artifacts: Artifacts) -> tuple[Policy, LanguageModel]:
+    return Policy(artifacts), LanguageModel(artifacts)
 
 
 def damaged(graph: str, change: Callable[[Floats], object]) -> Damage:
@@ -51,6 +58,18 @@ def flip_largest(values: Floats) -> None:
 
 def swap_rows(values: Floats) -> None:
     values[[10, 20]] = values[[20, 10]]
+
+
+def damaged_token(change: Callable[[Floats], object]) -> Damage:
+    """Change the embedding of a token that no prompt of the self-test contains."""
+
+    def change_row(model: onnx.ModelProto) -> None:
+        (tensor,) = (each for each in model.graph.initializer if each.name == "embed.weight")
+        values = onnx.numpy_helper.to_array(tensor).copy()
+        change(values[1000])
+        tensor.raw_data = values.tobytes()
+
+    return lambda directory: edit_graph(directory, "language_model", change_row)
 
 
 def zero_all(graph: str, directory: Path) -> None:
@@ -134,6 +153,9 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
     "the sign of one weight": (damaged("semantic_context", flip_largest), "semantic_context answers otherwise"),
     "two rows exchanged": (damaged("semantic_context", swap_rows), "semantic_context answers otherwise"),
     "other weights": (swap_graph, "vision_encoder answers otherwise"),
+    "a token's embedding is 0": (damaged_token(partial(scale, 0.0)), "vocabulary answers otherwise"),
+    "a token's embedding is scaled": (damaged_token(partial(scale, 1e4)), "vocabulary answers otherwise"),
+    "a token's embedding is NaN": (damaged_token(partial(scale, np.nan)), "vocabulary gives .* not finite"),
     "two tokens exchanged": (lambda d: exchange(d, "Ġleft", "Ġright"), "the prompt's token ids are not the exporter's"),
     "special tokens exchanged": (exchange_special, "the prompt's token ids are not the exporter's"),
     "a negative next token": (
@@ -141,7 +163,7 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
         r"the graphs do not run \(the language model's next tokens are \[-\d+",
     ),
 }  # fmt: skip
-FAST = ("one weight is NaN", "a matrix scaled by 0.99", "two tokens exchanged")
+FAST = ("one weight is NaN", "a matrix scaled by 0.99", "a token's embedding is 0", "two tokens exchanged")
 
 
 @pytest.mark.parametrize(
@@ -175,6 +197,28 @@ def test_other_kernels_give_the_exported_answers(artifacts: Artifacts, monkeypat
     assert open_proven(artifacts).tested.worst_share < 0.1
 
 
+def test_a_kv_buffer_of_an_unknown_type_is_refused(copy: Path) -> None:
+    names = ("past_key_values.9.key", "present.9.key")
+    axes: list[str | int | None] = [1, 2, "T9", 64]
+
+    def add_tensors(model: onnx.ModelProto) -> None:
+        before, after = (helper.make_tensor_value_info(name, TensorProto.DOUBLE, axes) for name in names)
+        model.graph.input.append(before)
+        model.graph.output.append(after)
+        model.graph.node.append(helper.make_node("Identity", [before.name], [after.name]))
+
+    def list_tensors(manifest: dict[str, Any]) -> None:
+        for key, name in zip(("inputs", "outputs"), names, strict=True):
+            tensor = {"name": name, "dtype": "tensor(double)", "shape": axes}
+            manifest["graphs"]["language_model"][key].append(tensor)
+
+    edit_graph(copy, "language_model", add_tensors)
+    edit_manifest(copy, list_tensors)
+    artifacts = load_artifacts(copy)
+    with pytest.raises(ArtifactError, match=r"past_key_values\.9\.key is tensor\(double\), expected one of float, "):
+        LanguageModel(artifacts)
+
+
 @pytest.mark.parametrize("output", ["visual_tokens", "last_layer_kv", "trajectory"])
 def test_a_provider_that_computes_wrongly_is_refused(
     artifacts: Artifacts, monkeypatch: pytest.MonkeyPatch, output: str
@@ -200,12 +244,33 @@ def test_a_manifest_without_answers_is_refused(artifacts: Artifacts) -> None:
         open_proven(dataclasses.replace(artifacts, known_answers=None))
 
 
+def test_artifacts_of_an_earlier_export_without_an_answer_to_the_vocabulary_pass(copy: Path) -> None:
+    edit_manifest(copy, lambda m: m["self_test"]["answers"].pop(VOCABULARY))
+    assert open_proven(load_artifacts(copy)).tested.worst_share < 0.1
+
+
+def test_of_a_large_vocabulary_a_sample_is_tested(artifacts: Artifacts, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(self_test, "MOST_VOCABULARY", 100)
+    sizes = {name: each.values.size for name, each in self_test.outputs(*opened(artifacts), self_test.Noise(1))}
+    assert sizes[VOCABULARY] == 100 * artifacts.runtime.kv_dim
+
+
+@pytest.mark.parametrize("number", [1e200, 1.7e308, 5e-324])
+@pytest.mark.filterwarnings("error")
+def test_an_absurd_digest_is_refused_without_a_warning(artifacts: Artifacts, number: float) -> None:
+    known = artifacts.known_answers
+    assert known is not None
+    answer = dataclasses.replace(known.answers["vision_encoder"], digest=(number,) * SUMS)
+    changed = dataclasses.replace(known, answers={**known.answers, "vision_encoder": answer})
+    with pytest.raises(ArtifactError, match="vision_encoder answers otherwise than at the export"):
+        check_answers(*opened(artifacts), changed)
+
+
 def test_a_self_test_that_takes_longer_than_its_limit_is_refused(artifacts: Artifacts) -> None:
     known = artifacts.known_answers
     assert known is not None
-    policy, language = Policy(artifacts), LanguageModel(artifacts)
     with pytest.raises(ArtifactError, match=r"takes longer than its limit of 0\.001 s"):
-        check_answers(policy, language, dataclasses.replace(known, limit_s=0.001))
+        check_answers(*opened(artifacts), dataclasses.replace(known, limit_s=0.001))
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from edge.artifacts.files import seal
+from edge.artifacts.known_answers import VOCABULARY
 from edge.artifacts.manifest import Artifacts
 from edge.core.cli import EXIT_CHECK_FAILED
 from edge.inference.self_test import SelfTestError
@@ -157,6 +158,17 @@ def test_tolerances_of_an_exporter_without_the_provider_are_accepted_for_an_acce
     recorded = {"limit_s": wide.limit_s, "same_tokens": wide.same_tokens, "answers": answers}
     found, expected = recorded_and_expected_limits(recorded, content, half=False)
     assert (found == expected) is accepted
+
+
+def test_limits_of_an_earlier_export_without_an_answer_to_the_vocabulary_are_accepted() -> None:
+    graph = {"precision": {"default": "fp32", "overrides": {}}, "session": {"provider": "CPUExecutionProvider"}}
+    content = {"graphs": {"language_model": graph}, "plan": {}}
+    limits = self_test_limits(content, half=False, replaced=False)
+    answers = {name: {"tolerance": tolerance} for name, tolerance in limits.tolerances.items()}
+    del answers[VOCABULARY]
+    recorded = {"limit_s": limits.limit_s, "same_tokens": limits.same_tokens, "answers": answers}
+    found, expected = recorded_and_expected_limits(recorded, content, half=False)
+    assert found == expected
 
 
 @pytest.mark.slow
