@@ -10,6 +10,8 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
+from firmware_bridge.system.terminal import one_line
+
 
 class Level(Enum):
     """Level of a check's result."""
@@ -66,8 +68,10 @@ def table(checks: Iterable[Check]) -> Table:
     made.add_column(overflow="fold")
     for check in checks:
         style = _STYLES[check.level]
-        text = escape(check.found)
+        # Names and paths from manifests and arguments may contain a terminal's control sequences.
+        found, expected, advice = (escape(one_line(each)) for each in (check.found, check.expected, check.advice))
+        text = found
         if check.level in (Level.WARN, Level.FAIL):
-            text += f"\n  expected {escape(check.expected)}\n  [bold]do this:[/] {escape(check.advice)}"
+            text += f"\n  expected {expected}\n  [bold]do this:[/] {advice}"
         made.add_row(check.name, f"[{style}]{check.level.value}[/]", text)
     return made

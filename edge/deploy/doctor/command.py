@@ -193,8 +193,11 @@ def _machine(
     logs = args.logs or (STATE_DIRECTORY if STATE_DIRECTORY.is_dir() else Path())
     yield doctor_machine.disk(logs.absolute(), _disk_usage)
     utc = datetime.timezone.utc
-    made = 0.0 if artifacts is None else (artifacts.directory / MANIFEST_NAME).stat().st_mtime
-    yield doctor_machine.wall_clock(datetime.datetime.now(utc), datetime.datetime.fromtimestamp(made, utc), root)
+    written_s = 0.0 if artifacts is None else (artifacts.directory / MANIFEST_NAME).stat().st_mtime
+    # A file system stores years that `datetime` cannot represent.
+    latest_s = datetime.datetime(9999, 1, 1, tzinfo=utc).timestamp()
+    made = datetime.datetime.fromtimestamp(min(max(written_s, 0.0), latest_s), utc)
+    yield doctor_machine.wall_clock(datetime.datetime.now(utc), made, root)
 
 
 def _nvpmodel() -> str | None:
