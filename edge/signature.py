@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import base64
 import json
+import os
 import sys
 import time
 from collections.abc import Sequence
@@ -102,13 +103,27 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
+def _check_json(args: argparse.Namespace) -> None:
+    """Refuse a result that would replace a key or a file of the artifacts. Raises KeyFileError or OSError."""
+    check_result_target(args.json)
+    if args.json in (None, "-"):
+        return
+    target = Path(os.path.realpath(args.json))
+    key, directory = vars(args).get("key"), vars(args).get("directory")
+    keys = [each for each in (key, vars(args).get("trust"), key and f"{key}.pub") if each is not None]
+    if target in [Path(os.path.realpath(each)) for each in keys]:
+        raise KeyFileError(f"--json {args.json}: is a key file, which the result would replace; name another file")
+    if directory is not None and Path(os.path.realpath(directory)) in target.parents:
+        raise KeyFileError(f"--json {args.json}: lies in the artifact directory; name a file outside it")
+
+
 @command_line("signature")
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
     started_ns = time.monotonic_ns()
     try:
-        check_result_target(args.json)
+        _check_json(args)
         if args.command == "keygen":
             result: dict[str, Any] = {"key": str(args.key), "key_id": keygen(args.key)}
         elif args.command == "sign":

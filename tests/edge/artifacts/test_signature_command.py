@@ -93,6 +93,29 @@ def test_a_missing_argument_is_named(arguments: list[str], missing: str, capsys:
 
 
 @pytest.mark.parametrize(
+    "line",
+    [
+        "keygen --key new.pem --json new.pem",
+        "keygen --key new.pem --json ./new.pem.pub",
+        "sign nano --key release.pem --release 1 --json release.pem",
+        "sign nano --key release.pem --release 1 --json link.json",
+        "sign nano --key release.pem --release 1 --json nano/manifest.json",
+        "verify nano --trust release.pem.pub --json release.pem.pub",
+    ],
+)
+def test_a_result_replaces_no_key_and_no_artifact(
+    line: str, key: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(key.parent)
+    (key.parent / "nano").mkdir()
+    (key.parent / "link.json").symlink_to(key)
+    before = {path.name: path.read_bytes() for path in key.parent.iterdir() if path.is_file()}
+    assert main(line.split()) == 2
+    assert capsys.readouterr().err.startswith(f"signature: --json {line.split()[-1]}: ")
+    assert {path.name: path.read_bytes() for path in key.parent.iterdir() if path.is_file()} == before
+
+
+@pytest.mark.parametrize(
     ("command", "shown"),
     [
         ("keygen", ["--key FILE ", "--json FILE|- "]),
