@@ -6,9 +6,12 @@ This module does without torch, which takes seconds to load: bad arguments are r
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 
 from edge.core.cli import check_result_directory, check_result_target
+from export.core.replaceable import check_replaceable
+from export.evaluation.calibration_names import name_refusal
 from export.model.config import TicVlaConfig, config_for, model_settings, with_overrides
 from export.targets.file import Target, load_target, with_settings
 from firmware_bridge.system.terminal import CommandParser
@@ -91,7 +94,10 @@ def parser() -> argparse.ArgumentParser:
 
 
 def check(args: argparse.Namespace) -> None:
-    """Check everything but the weights and the artifacts. Raises UsageError, TargetError, ModelConfigError, OSError."""
+    """Check everything but the weights and the artifacts.
+
+    Raises UsageError, TargetError, ModelConfigError, ArtifactError for a directory that is not replaced, or OSError.
+    """
     if args.list_targets:
         return
     check_result_target(args.json)
@@ -99,6 +105,11 @@ def check(args: argparse.Namespace) -> None:
         raise UsageError(f"--cache-gb {args.cache_gb:g}: expected a size above 0")
     if args.random_weights is not None and not 0 <= args.random_weights < 2**63:
         raise UsageError(f"--random-weights {args.random_weights}: expected a seed from 0 to 2^63 - 1")
+    for path in args.checkpoint:
+        if not path.exists():
+            raise UsageError(f"--checkpoint {path}: no such file or directory; expected a checkpoint")
+    if args.calibration is not None and (refusal := name_refusal(args.calibration)) is not None:
+        raise UsageError(refusal)
     if args.command == "verify":
         _check_verify(args)
         return
@@ -108,6 +119,11 @@ def check(args: argparse.Namespace) -> None:
         raise UsageError("--out is missing: expected a directory to write, e.g. --out out/nano")
     check_result_directory(args.out)
     target_and_config(args)
+    if not args.dry_run:
+        out = Path(os.path.realpath(args.out))
+        if not out.name:
+            raise UsageError(f"--out {out}: expected a directory that can be created")
+        check_replaceable(out)
 
 
 def target_and_config(args: argparse.Namespace) -> tuple[Target, TicVlaConfig]:

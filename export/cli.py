@@ -34,7 +34,7 @@ from export.evaluation.calibration import CalibrationError, load_calibration
 from export.evaluation.gates import GateError
 from export.model.config import PRESETS, ModelConfigError, TicVlaConfig
 from export.model.weights import WeightsError, save_weights
-from export.pipeline.artifacts import build_artifacts, check_replaceable, verify_directory
+from export.pipeline.artifacts import build_artifacts, verify_directory
 from export.pipeline.build import build_stages
 from export.pipeline.early_checks import check_settings
 from export.pipeline.job import ExportRequest, Job, WeightSource, job_of
@@ -84,8 +84,6 @@ def _export(args: argparse.Namespace) -> dict[str, Any] | None:
     if args.dry_run:
         return None
     out = Path(os.path.realpath(args.out))
-    if not out.name:
-        raise UsageError(f"--out {out}: expected a directory that can be created")
     for option, path in (("--save-weights", args.save_weights), ("--json", args.json)):
         if path is None or str(path) == "-":
             continue
@@ -95,7 +93,6 @@ def _export(args: argparse.Namespace) -> dict[str, Any] | None:
                 f"{option} {path}: lies inside --out, which is replaced as a whole; name a path outside it"
             )
         check_result_target(str(path), option)
-    check_replaceable(out)
     weights = WeightSource(config, args.checkpoint, args.random_weights)
     job = Job(target, weights, load_calibration(args.calibration or DEFAULT_CALIBRATION), _request(args))
     with _cache(args, out.parent) as cache:

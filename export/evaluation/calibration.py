@@ -20,11 +20,11 @@ import numpy.typing as npt
 from edge.core.geometry import SE2
 from edge.reasoning.prompt import InstructionError, check_instruction
 from export.core.typed import FieldError, build
+from export.evaluation.calibration_names import SETS, name_refusal
 from firmware_bridge.system.input_file import open_regular, parse_toml, read_bytes
 
 Picture = npt.NDArray[np.uint8]
 
-SETS = Path(__file__).with_name("calibration_sets")
 CLIP_S = 20.0
 """Shortest clip, s: 9 s of frames before an anchor, 10 s of growing delay after it, 1 s to choose the anchor in."""
 MAX_GAP_S = 1.5
@@ -122,22 +122,15 @@ class _SetFile:
     clips: tuple[_ClipRow, ...]
 
 
-def list_calibration_sets() -> list[str]:
-    """Return the names of the shipped sets."""
-    return sorted(path.parent.name for path in SETS.glob("*/set.toml"))
-
-
 def load_calibration(name: str) -> CalibrationSet:
     """Load a set by name, `folder:PATH` or `video:PATH`. Raises CalibrationError with a one-line message."""
+    if (refusal := name_refusal(name)) is not None:
+        raise CalibrationError(refusal)
     kind, colon, path = name.partition(":")
-    if colon and kind in USER_KINDS and path:
-        return USER_KINDS[kind](f"{kind}:{Path(os.path.realpath(path)).name}", Path(path))
-    if name not in list_calibration_sets():
-        known = ", ".join(list_calibration_sets())
-        raise CalibrationError(
-            f"calibration set {name!r} is not known; expected one of: {known}, folder:PATH, video:PATH"
-        )
-    return read_set(SETS / name)
+    if not colon:
+        return read_set(SETS / name)
+    load = _load_folder if kind == "folder" else _load_video
+    return load(f"{kind}:{Path(os.path.realpath(path)).name}", Path(path))
 
 
 def read_set(directory: Path) -> CalibrationSet:
@@ -269,6 +262,3 @@ def _video_frames(path: Path, where: str) -> list[Picture]:
     finally:
         capture.release()
     return images
-
-
-USER_KINDS = {"folder": _load_folder, "video": _load_video}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import fcntl
 import json
 import os
@@ -18,6 +17,7 @@ from edge.artifacts.manifest import load_artifacts
 from edge.artifacts.runtime import SPECIAL_TOKENS
 from edge.inference.start_guard import Memory, StartGuard
 from export.core.cache import StageCache, file_sha256, fsync_path, package_versions
+from export.core.replaceable import check_replaceable
 from export.evaluation.gates import WARN, GateResult, require
 from export.evaluation.task_samples import is_large
 from export.graphs.build import graph_contract, graph_parameters
@@ -34,7 +34,6 @@ from export.pipeline.self_test import (
 )
 from export.plan.plan import Plan, plan
 from export.targets.file import Target
-from firmware_bridge.system.input_file import open_regular, read_json
 from reporting.progress import BuildProgress
 
 REPORT_JSON, REPORT_HTML, TOKENIZER_NAME = "report.json", "report.html", "tokenizer.json"
@@ -47,8 +46,6 @@ GATE_SLOWER, LEAST_GATE_S = 20.0, 60.0
 """Time limit of a gate on files of unknown origin: a multiple of its expected duration, and time added to it, s."""
 UNLIMITED = Memory(own=lambda: 0, available=lambda: 0)
 """PyTorch's model and its outputs share the gates' process: only their time is limited."""
-OLDER_SCHEMAS = (1, 2, 3)
-"""Manifest schemas whose directories an export may replace."""
 
 
 def manifest_runtime(target: Target, config: TicVlaConfig, made: Plan) -> dict[str, object]:
@@ -119,47 +116,6 @@ def workplace(out: Path) -> Iterator[Path]:
             shutil.rmtree(work, ignore_errors=True)
     finally:
         os.close(descriptor)
-
-
-def check_replaceable(out: Path) -> None:
-    """Refuse to replace a directory unless it is empty or holds only files of an export."""
-    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
-        return
-    listed = {MANIFEST_NAME, *_files_of(out)}
-    others = sorted(path.name for path in out.iterdir() if path.name not in listed)
-    if others:
-        raise ArtifactError(
-            f"{out / others[0]}: not written by edge-export, so {out} is not replaced; name another directory"
-        )
-
-
-def _files_of(out: Path) -> dict[str, Any]:
-    """Return the files that a manifest lists; those of an older schema only if all match it. Raises ArtifactError."""
-    try:
-        listed = read_manifest(out)["files"]
-        if not isinstance(listed, dict):
-            raise ArtifactError(f"{out / MANIFEST_NAME}: files must be an object; name another directory")
-        return dict(listed)
-    except ArtifactError:
-        try:
-            older = read_json(out / MANIFEST_NAME)
-            files = dict(older["files"])
-            # All names before any file: hashing a listed device would never end.
-            ours = older["schema_version"] in OLDER_SCHEMAS and all(Path(name).name == name for name in files)
-            ours = ours and all(_regular_sha256(out / name) == entry["sha256"] for name, entry in files.items())
-        except (OSError, ValueError, KeyError, TypeError):
-            ours = False
-        if not ours:
-            raise
-        return files
-
-
-def _regular_sha256(path: Path) -> str:
-    """Hash a regular file of this directory; raises OSError for a link, a device or a FIFO."""
-    if path.is_symlink():
-        raise OSError(errno.ELOOP, "is a link", str(path))
-    open_regular(path).close()
-    return file_sha256(path)
 
 
 def _swap(made: Path, out: Path, retired: Path) -> None:

@@ -29,6 +29,7 @@ from sim_hil.benchmark.conditions.conditions import (
 )
 from sim_hil.benchmark.conditions.latency import LatencyProfile, parse_latency
 from sim_hil.benchmark.policies.external_protocol import Address, ExternalError
+from sim_hil.benchmark.results.store import check_new
 from sim_hil.benchmark.suite.episode import Episode, load_suite, suite_names
 from sim_hil.benchmark.workers.task import FLIGHT_CHOICES, VIDEO_CHOICES
 from sim_hil.realtime.robots import GO2, ROBOTS
@@ -135,12 +136,14 @@ def parser() -> argparse.ArgumentParser:
 def check(args: argparse.Namespace) -> tuple[Conditions, list[Episode]]:
     """Check everything but the policy's files; return conditions and chosen episodes.
 
-    Raises ConditionsError, LatencyError, SuiteError, ExternalError or OSError.
+    Raises ConditionsError, LatencyError, SuiteError, StoreError, ExternalError or OSError.
     """
     check_result_target(args.json)
     if args.out is None and (args.resume or args.video != "none"):
         raise ConditionsError("--resume and --video need a directory: add --out DIR")
     check_result_directory(args.out)
+    if args.out is not None and not args.resume:
+        check_new(args.out)
     if not 1 <= args.jobs <= MAX_JOBS:
         raise ConditionsError(f"--jobs: expected 1 to {MAX_JOBS}, found {args.jobs}")
     if args.cluster is not None:

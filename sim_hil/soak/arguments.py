@@ -12,6 +12,7 @@ from typing import Final
 
 from edge.core.cli import check_result_directory, check_result_target
 from edge.inference.release import parse_release_delay
+from firmware_bridge.system.input_file import MAX_INTEGER
 from firmware_bridge.system.terminal import CommandParser
 from sim_hil.realtime.robots import GO2, MAX_DOMAIN, ROBOTS
 from sim_hil.robots.odometry_noise import LEVELS
@@ -23,6 +24,11 @@ MODES: Final = ("async", "sync", "no-reasoning")
 UNTRAINED_MPS: Final = 0.14
 """Default speed limit for untrained weights, m/s: they drive into walls, which below 0.2 m/s (edge.odometry.gate) does
 not end the run, so that the growth of the runner can be measured."""
+MAX_PEOPLE: Final = 500
+"""The limit of `edge-hil`, whose module loads scipy."""
+SHORTEST_LEG_S: Final = 15.0
+LONGEST_LEG_S: Final = 86_400.0
+LONGEST_SOAK_S: Final = 30 * 86_400.0
 _UNITS_S: Final = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0}
 EXAMPLES = """examples:
   edge-soak --artifacts out/nano --duration 2h --out out/soak
@@ -104,6 +110,14 @@ def check(args: argparse.Namespace) -> None:
     check_result_target(args.json)
     check_result_directory(args.out)
     parse_release_delay(args.release_delay)
+    if not SHORTEST_LEG_S <= args.duration <= LONGEST_SOAK_S:
+        raise SoakInputError(f"--duration: expected {SHORTEST_LEG_S:g} s to 30 days, found {args.duration:g} s")
+    if not SHORTEST_LEG_S <= args.leg <= LONGEST_LEG_S:
+        raise SoakInputError(f"--leg: expected {SHORTEST_LEG_S:g} s to a day, found {args.leg:g} s")
+    if not 0 <= args.people <= MAX_PEOPLE:
+        raise SoakInputError(f"--people: expected 0 to {MAX_PEOPLE}, found {args.people}")
+    if not 0 <= args.seed <= MAX_INTEGER:
+        raise SoakInputError(f"--seed: expected 0 to {MAX_INTEGER}, found {args.seed}")
     if args.domain is not None and not 0 <= args.domain <= MAX_DOMAIN:
         raise SoakInputError(f"--domain: expected 0 to {MAX_DOMAIN}, found {args.domain}")
     for scene in args.scene or ():

@@ -23,6 +23,7 @@ from sim_hil.realtime.stack import StackOptions
 from sim_hil.realtime.truth import read_lines
 from sim_hil.scene.scene import Vec3, load_scene
 from sim_hil.soak.analysis import ANALYSIS, analyse, keep_moments
+from sim_hil.soak.arguments import SHORTEST_LEG_S
 from sim_hil.soak.faults import FaultMenu, SoakInputError
 from sim_hil.soak.leg import LEG, SAMPLES, Leg, LegOptions
 from sim_hil.soak.tasks import Journey
@@ -30,7 +31,6 @@ from sim_hil.soak.verdict import FAIL, PASS, UNDECIDED, BudgetLine, is_lost, jud
 
 CONFIG: Final = "config.json"
 LEGS: Final = "legs"
-SHORTEST_LEG_S: Final = 15.0
 FAILED_LEGS: Final = 3
 """Number of consecutive failed legs that ends the soak, because retrying does not help."""
 
@@ -59,14 +59,6 @@ class SoakOptions:
     """Name of the robot (sim_hil.realtime.robots)."""
     faults: str
     """Value of --faults: default, none, or the path of a fault menu."""
-
-    def __post_init__(self) -> None:
-        if not SHORTEST_LEG_S <= self.duration_s <= 30 * 86_400:
-            raise SoakInputError(f"--duration: expected {SHORTEST_LEG_S:g} s to 30 days, found {self.duration_s:g} s")
-        if not SHORTEST_LEG_S <= self.leg_s <= 86_400:
-            raise SoakInputError(f"--leg: expected {SHORTEST_LEG_S:g} s to a day, found {self.leg_s:g} s")
-        if self.people < 0 or self.seed < 0 or not self.scenes:
-            raise SoakInputError("--people and --seed: expected 0 or more, and one scene or more")
 
     def config(self) -> dict[str, Any]:
         """Return the options that a resumed soak must share."""

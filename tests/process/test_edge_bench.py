@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from sim_hil.benchmark import cli
+from sim_hil.benchmark import cli, run_command
 from sim_hil.benchmark.results.store import StoreError, read_results
 from tests.support.benchmark import dynanav_fakes as fakes
 from tests.support.processes import REPOSITORY
@@ -133,8 +133,8 @@ def test_signals_wait_until_the_temporary_folder_is_removed(
         raise StoreError("made up")
 
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    monkeypatch.setattr(cli, "execute", fail)
-    monkeypatch.setattr("sim_hil.benchmark.cli.shutil.rmtree", removed)
+    monkeypatch.setattr(run_command, "execute", fail)
+    monkeypatch.setattr("sim_hil.benchmark.run_command.shutil.rmtree", removed)
     assert cli.main(["--suite", str(suite), "--episodes", "walk-1", "--policy", "still"]) == 2
     assert len(handlers) == 1 and handlers[0] is not signal.SIG_DFL
     assert list(tmp_path.glob("edge-bench-*")) == []

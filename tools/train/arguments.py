@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import os
 import re
 from pathlib import Path
 from typing import Final
@@ -15,7 +16,7 @@ from typing import Final
 from edge.core.cli import check_result_directory, check_result_target
 from edge.inference.latency_profile import load_profile
 from firmware_bridge.system.terminal import CommandParser
-from tools.train.config.checks import TrainError
+from tools.train.config.checks import TrainError, check_processes, check_run_folder
 from tools.train.config.recipe import ALL, VARIANTS, Recipe, load_recipe, recipe_names
 
 COMMAND: Final = "edge-train"
@@ -100,6 +101,7 @@ def parser() -> argparse.ArgumentParser:
 def check(args: argparse.Namespace) -> Recipe:
     """Check all but data and weights; return the recipe. Raises TrainError, RecipeError, LatencyError, OSError."""
     check_result_target(args.json)
+    check_processes(os.environ)
     recipe = _recipe(args)
     if re.fullmatch(r"cpu|cuda(:[0-9]{1,3})?", args.device) is None:
         raise TrainError(f"--device {args.device}: expected cpu, cuda or cuda:N")
@@ -127,6 +129,7 @@ def check(args: argparse.Namespace) -> Recipe:
     if args.after is not None and not args.checkpoint:
         raise TrainError("--after: expected --checkpoint with it, the weights that the step wrote")
     _check_inputs(args)
+    check_run_folder(args.out)
     return recipe
 
 

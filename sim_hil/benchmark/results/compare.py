@@ -12,7 +12,6 @@ from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, check_result_target, comman
 from firmware_bridge.system.terminal import CommandParser, one_line
 from sim_hil.benchmark.conditions.conditions import Conditions, ConditionsError
 from sim_hil.benchmark.results.record import ResultError
-from sim_hil.benchmark.results.report import write_report
 from sim_hil.benchmark.results.store import (
     CONFIG,
     ResultStore,
@@ -99,6 +98,8 @@ def _finished_config(directory: Path) -> dict[str, Any]:
 def _report(directory: Path) -> int:
     config = _finished_config(directory)
     store = ResultStore(directory, config, read_results(directory), failed=read_failed(directory))
+    from sim_hil.benchmark.results.report import write_report  # it loads matplotlib, which takes seconds
+
     title = f"DynaNav: {Path(config['suite']).stem}, {Conditions.of_json(config['conditions']).policy}"
     sys.stdout.write(f"{write_report(store, summarise(store.results), title)}\n")
     return EXIT_DONE

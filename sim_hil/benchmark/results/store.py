@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from edge.core.cli import write_whole
-from firmware_bridge.system.input_file import parse_json, read_json
+from firmware_bridge.system.input_file import parse_json, read_bytes, read_json, read_text
 from sim_hil.benchmark.results.record import EpisodeResult, FailedRun, ResultError
 
 CONFIG, RESULTS, FAILED = "config.json", "results.jsonl", "failed.jsonl"
@@ -49,11 +49,7 @@ class ResultStore:
     @staticmethod
     def create(directory: Path, config: Mapping[str, object]) -> ResultStore:
         """Create a run in a new or empty directory. Raises StoreError."""
-        if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
-            raise StoreError(
-                f"--out {directory}: expected a new or empty directory; continue that run with --resume, or name "
-                "another one"
-            )
+        check_new(directory)
         _make(directory)
         write_whole(directory / CONFIG, json.dumps(config, indent=1) + "\n")
         return ResultStore(directory, config, (), _locked(directory))
@@ -109,6 +105,15 @@ class ResultStore:
         """Record that an episode has no result."""
         _append(self.directory / FAILED, asdict(failed))
         self._failed.append(failed)
+
+
+def check_new(directory: Path) -> None:
+    """Raise StoreError unless a run can begin in a directory, which is new or empty."""
+    if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
+        raise StoreError(
+            f"--out {directory}: expected a new or empty directory; continue that run with --resume, or name another "
+            "one"
+        )
 
 
 def read_config(directory: Path) -> dict[str, Any]:
@@ -190,16 +195,19 @@ def _append(path: Path, content: Mapping[str, object]) -> None:
 
 def _whole_lines(path: Path) -> list[str]:
     try:
-        return path.read_text(encoding="utf-8").split("\n")[:-1]
-    except (OSError, UnicodeDecodeError) as error:
+        return read_text(path).split("\n")[:-1]
+    except (OSError, ValueError) as error:
         raise StoreError(f"{path}: cannot be read ({error})") from error
 
 
 def _cut_torn_line(path: Path) -> None:
-    """Remove an incomplete last line, left by a process that died while writing."""
+    """Remove an incomplete last line, left by a process that died while writing. Raises StoreError."""
     if not path.exists():
         return
-    data = path.read_bytes()
+    try:
+        data = read_bytes(path)
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be read ({error})") from error
     whole = data.rfind(b"\n") + 1
     if whole < len(data):
         with path.open("r+b") as file:

@@ -15,13 +15,12 @@ import pytest
 
 from export.evaluation.calibration import (
     CLIP_S,
-    SETS,
     CalibrationError,
     CalibrationSet,
-    list_calibration_sets,
     load_calibration,
     read_set,
 )
+from export.evaluation.calibration_names import SETS, list_calibration_sets
 from tools.calibration_frames import WALKS, record
 
 

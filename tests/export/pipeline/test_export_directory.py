@@ -14,7 +14,8 @@ from edge.artifacts.files import SCHEMA_VERSION, SECTIONS, ArtifactError, seal
 from edge.artifacts.manifest import load_artifacts
 from export.cli import main
 from export.core.cache import StageCache
-from export.pipeline.artifacts import build_artifacts, check_replaceable, workplace
+from export.core.replaceable import check_replaceable
+from export.pipeline.artifacts import build_artifacts, workplace
 from tests.support.export.export_job import job, manifest, progress
 
 

@@ -7,7 +7,7 @@ import argparse
 import pytest
 
 from edge.live import options
-from sim_hil.benchmark import cli
+from sim_hil.benchmark import run_command
 
 
 @pytest.mark.parametrize(("address", "hosts"), [("0.0.0.0", ["127.0.0.1", "192.0.2.7"]), ("127.0.0.1", ["127.0.0.1"])])
@@ -16,7 +16,7 @@ def test_the_benchmark_prints_an_address_for_every_computer_that_may_watch(
 ) -> None:
     monkeypatch.setattr(options, "_own_address", lambda *_: "192.0.2.7")
     args = argparse.Namespace(live=8765, live_address=address, live_token=None)
-    with cli._live_view(args, "realtime") as live:
+    with run_command._live_view(args, "realtime") as live:
         assert live is not None
         token = live.token()
     lines = capsys.readouterr().err.splitlines()

@@ -2,13 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf
+from pathlib import Path
 from typing import Annotated, TypeAlias, get_args, get_type_hints
 
 
 class TrainError(Exception):
     """Arguments, files, weights or data that cannot be used; one line: what, expected, found, what to do."""
+
+
+def check_run_folder(out: Path) -> None:
+    """Raise TrainError unless a folder is new, empty or that of a run."""
+    if (out / "recipe.toml").exists() or not out.exists():
+        return
+    if not out.is_dir() or any(out.iterdir()):
+        raise TrainError(f"{out}: expected a new or empty directory, or a run folder of edge-train")
+
+
+def check_processes(environment: Mapping[str, str]) -> None:
+    """Raise TrainError for variables with which torch could not join the processes that torchrun started."""
+    for name in ("WORLD_SIZE", "RANK", "LOCAL_RANK", "LOCAL_WORLD_SIZE"):
+        value = environment.get(name, "1")
+        if not (value.isascii() and value.isdecimal() and len(value) <= 6) or (name == "WORLD_SIZE" and not int(value)):
+            raise TrainError(f"{name} is {value!r:.80}, expected a number from torchrun; unset it to train alone")
+    if int(environment.get("WORLD_SIZE", "1")) > 1:
+        for name in ("RANK", "MASTER_ADDR", "MASTER_PORT"):
+            if not environment.get(name):
+                raise TrainError(f"WORLD_SIZE is set without {name}; start the processes with torchrun, or unset it")
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from edge.core.cli import write_whole
 from export import model
 from firmware_bridge.system.input_file import parse_json, read_json
 from sim_hil.benchmark.workers.code_version import code_sha256
-from tools.train.config.checks import TrainError
+from tools.train.config.checks import TrainError, check_run_folder
 from tools.train.config.recipe import STAGES, Recipe, load_recipe
 from tools.train.drives.dataset import DatasetWriter
 from tools.train.drives.drive import Dataset
@@ -46,13 +46,11 @@ class RunDir:
         The configuration of a stage that has not started may still be changed.
         """
         run_dir = RunDir(out)
-        if run_dir.recipe_path.exists():
-            if changed := run_dir._changed(recipe):
-                raise TrainError(
-                    f"{out}: was started with another recipe ({changed}); name another --out, or restore the values"
-                )
-        elif out.exists() and (not out.is_dir() or any(out.iterdir())):
-            raise TrainError(f"{out}: expected a new or empty directory, or a run folder of edge-train")
+        if run_dir.recipe_path.exists() and (changed := run_dir._changed(recipe)):
+            raise TrainError(
+                f"{out}: was started with another recipe ({changed}); name another --out, or restore the values"
+            )
+        check_run_folder(out)
         out.mkdir(parents=True, exist_ok=True)
         run_dir._note_versions()
         write_whole(run_dir.recipe_path, recipe.to_toml())

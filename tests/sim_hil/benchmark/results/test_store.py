@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -123,6 +124,33 @@ def test_a_damaged_line_is_refused_with_its_number(
     (store.directory / name).write_text(f"{line}\n")
     with pytest.raises(StoreError, match=f"{name}:1: {problem}"):
         read(store.directory)
+
+
+def make_sparse(path: Path) -> None:
+    path.touch()
+    os.truncate(path, 3 << 30)
+
+
+SPECIAL: dict[str, tuple[Callable[[Path], object], str]] = {
+    "a FIFO": (os.mkfifo, "is not a regular file"),
+    "a link to /dev/zero": (lambda path: path.symlink_to("/dev/zero"), "is not a regular file"),
+    "a sparse file of 3 GB": (make_sparse, "is larger than 64000000 bytes"),
+}
+
+
+@pytest.mark.parametrize(("make", "found"), SPECIAL.values(), ids=SPECIAL)
+@pytest.mark.timeout(20)
+def test_results_that_would_hang_or_fill_the_memory_are_refused(
+    tmp_path: Path, make: Callable[[Path], object], found: str
+) -> None:
+    store = made(tmp_path)
+    store.close()
+    for name, read in ((RESULTS, read_results), (FAILED, read_failed)):
+        make(store.directory / name)
+        with pytest.raises(StoreError, match=f"{name}: cannot be read .*{found}"):
+            read(store.directory)
+    with pytest.raises(StoreError, match=f"{RESULTS}: cannot be read .*{found}"):
+        ResultStore.resume(store.directory, CONFIG)
 
 
 @pytest.mark.parametrize(
