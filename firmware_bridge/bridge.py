@@ -366,10 +366,11 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:  # of a process that serves it is a signal to leave
         _print(f"{args.command} interrupted, perhaps after it was sent; see: edge-bridge status")
         return 130
-    return code if args.json is None else max(code, _write_result(json.dumps(result, indent=2) + "\n", args.json))
+    return code if args.json is None else _write_result(json.dumps(result, indent=2) + "\n", args.json, code)
 
 
-def _write_result(text: str, where: str = "-") -> int:
+def _write_result(text: str, where: str = "-", code: int = 0) -> int:
+    """Write to a file or to standard output; return `code`, or 1 when it cannot be written."""
     try:
         if where == "-":
             write_descriptor(sys.stdout.fileno(), text.encode())
@@ -378,7 +379,7 @@ def _write_result(text: str, where: str = "-") -> int:
     except OSError as error:
         _print(f"the result could not be written: {error.strerror or error}")
         return 1
-    return 0
+    return code
 
 
 def _print(message: object) -> None:

@@ -129,7 +129,7 @@ def test_an_interrupted_calibration_reports_the_interrupt(
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda folder: folder / "missing.mcap", "No such file"),
+        (lambda folder: folder / "missing.mcap", "no such file"),
         (lambda folder: _text(folder / "a.mcap", "not a log"), "not an MCAP file"),
         (lambda folder: write_log(folder / "b.mcap", drive(1)), "expected at least 100"),
     ],
