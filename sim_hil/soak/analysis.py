@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import hypot
 from pathlib import Path
@@ -334,9 +334,8 @@ def worst(analysis: Mapping[str, Any]) -> list[Moment]:
 
 def keep_moments(folder: Path, analysis: Mapping[str, object]) -> None:
     """Write the animations of the worst moments into the leg's folder. Raises OSError."""
-    kept = []
-    for moment in worst(analysis):
-        frames = _frames(folder, moment.t_ns)
+    kept, moments = [], worst(analysis)
+    for moment, frames in zip(moments, _frames(folder, [moment.t_ns for moment in moments]), strict=True):
         name = f"{moment.kind.replace(' ', '-')}.gif"
         if frames:
             _write(folder / name, frames, moment)
@@ -352,19 +351,25 @@ def read_moments(folder: Path) -> list[Moment]:
         return []
 
 
-def _frames(folder: Path, t_ns: int) -> list[tuple[float, bytes]]:
-    """Return (time relative to the moment s, JPEG) of the images around it, from the leg's flight logs."""
-    low_ns, high_ns = t_ns - round(BEFORE_S * 1e9), t_ns + round(AFTER_S * 1e9)
-    found: list[tuple[float, bytes]] = []
-    for log in sorted(folder.glob("flight-*.mcap")):
+def _frames(folder: Path, moments_ns: Sequence[int]) -> list[list[tuple[float, bytes]]]:
+    """Return (time relative to the moment s, JPEG) of the images around each moment, from the leg's flight logs."""
+    found: list[list[tuple[float, bytes]]] = [[] for _ in moments_ns]
+    # The first part of each log: its other parts are read with it, hundreds of megabytes of a leg.
+    for log in sorted(path for path in folder.glob("flight-*.mcap") if "." not in path.stem):
         try:
             for topic, stamp_ns, payload in read_messages(log):
-                if topic == "/camera" and low_ns <= stamp_ns <= high_ns:
-                    found.append(((stamp_ns - t_ns) / 1e9, jpeg_bytes(payload)))
+                for t_ns, frames in zip(moments_ns, found, strict=True):
+                    at_s = (stamp_ns - t_ns) / 1e9
+                    if topic == "/camera" and -BEFORE_S <= at_s <= AFTER_S:
+                        frames.append((at_s, jpeg_bytes(payload)))
         except (OSError, RecordingError, ValueError):
             continue  # the runner was killed before it wrote data
+    return [_thinned(frames) for frames in found]
+
+
+def _thinned(frames: list[tuple[float, bytes]]) -> list[tuple[float, bytes]]:
     kept: list[tuple[float, bytes]] = []
-    for at_s, jpeg in sorted(found, key=lambda frame: frame[0]):
+    for at_s, jpeg in sorted(frames, key=lambda frame: frame[0]):
         if not kept or at_s - kept[-1][0] >= 0.9 / FPS:
             kept.append((at_s, jpeg))
     return kept
