@@ -81,11 +81,13 @@ def runtime_dir() -> Path:
 def runtime_dirs() -> tuple[Path, ...]:
     """Return the directories in which a bridge that this user has started by hand may listen, `runtime_dir()` first.
 
-    A shell of `su` or cron has no XDG_RUNTIME_DIR, so that the same user's bridge listens elsewhere.
+    A shell of `su` or cron has no XDG_RUNTIME_DIR, so that the same user's bridge listens elsewhere. One that is not
+    the login manager's was chosen on purpose: then there is no other.
     """
-    user = os.getuid()
-    others = (RUN_USER / str(user) / "tic-vla-edge", TMP / f"tic-vla-edge-{user}")
-    return tuple(dict.fromkeys((runtime_dir(), *others)))
+    own, session = os.environ.get("XDG_RUNTIME_DIR", ""), RUN_USER / str(os.getuid())
+    if own and Path(own) != session:
+        return (runtime_dir(),)
+    return tuple(dict.fromkeys((runtime_dir(), session / "tic-vla-edge", TMP / f"tic-vla-edge-{os.getuid()}")))
 
 
 @dataclass(frozen=True)

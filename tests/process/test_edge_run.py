@@ -141,7 +141,7 @@ def test_after_an_emergency_stop_the_runner_waits_and_reports_it_in_one_line_unt
     assert operate("stop", robot.socket)[0] == 0
     with running("edge.run.command", *robot.arguments(), folder=robot.folder, ready=waiting) as runner:
         time.sleep(3.0)
-        assert robot.moves() == []
+        assert all(is_zero for _, is_zero in robot.moves()), "the stop itself sends one zero"
         assert operate("arm", robot.socket)[0] == 0
         wait_for(robot.is_moving, 30, "the robot to be told to move")
         assert runner.stderr().count(waiting) == 1

@@ -179,11 +179,35 @@ class TestDelay:
         assert order.accept(state(102 * S, received_ns=40 * S))
         assert order.accept(state(102 * S + 1, received_ns=40 * S + 1))
 
-    def test_a_silence_of_five_seconds_is_no_new_start(self) -> None:
+    @pytest.mark.parametrize(("more_ns", "believed"), [(0, False), (1, True)])
+    def test_only_a_silence_of_more_than_five_seconds_is_a_new_start(self, more_ns: int, believed: bool) -> None:
         order = StampOrder()
         assert order.accept(state(100 * S, received_ns=10 * S))
-        assert not order.accept(state(102 * S, received_ns=15 * S)) and order.dropped == 1
-        assert not order.accept(state(102 * S + 1, received_ns=15 * S + 1))
+        assert order.accept(state(102 * S, received_ns=15 * S + more_ns)) is believed
+        assert order.dropped == (not believed)
+        assert order.accept(state(102 * S + 1, received_ns=15 * S + more_ns + 1)) is believed
+
+    @pytest.mark.parametrize(("back_ns", "believed"), [(S // 10, False), (S // 10 + 1, True)])
+    def test_only_a_clock_that_goes_back_by_more_than_100_ms_was_set(self, back_ns: int, believed: bool) -> None:
+        order = StampOrder()
+        assert order.accept(state(100 * S, received_ns=10 * S))
+        assert not order.accept(state(100 * S - back_ns, received_ns=10 * S + 1))
+        assert order.accept(state(100 * S + 1, received_ns=12 * S)) is believed
+
+    @pytest.mark.parametrize(("late_ns", "believed"), [(500_900_000, True), (500_900_001, False)])
+    def test_a_report_may_be_late_by_half_a_second_and_the_drift_since_the_last_one(
+        self, late_ns: int, believed: bool
+    ) -> None:
+        order, now_ns = StampOrder(), 10_900_000_000
+        assert order.accept(state(10 * S, received_ns=10 * S))
+        assert order.accept(state(now_ns - late_ns, received_ns=now_ns)) is believed
+
+    def test_a_clock_of_one_nanosecond_is_one(self) -> None:
+        order = StampOrder()
+        assert all(order.accept(state(0, received_ns=k * S)) for k in range(1, 100))
+        assert order.accept(state(1, received_ns=100 * S))
+        assert order.accept(state(2, received_ns=100 * S + 1))
+        assert not order.accept(state(3, received_ns=100 * S + S * 9 // 10))
 
     def test_a_robot_that_begins_to_fill_in_stamps_late_is_believed(self) -> None:
         order = StampOrder()

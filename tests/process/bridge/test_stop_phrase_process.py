@@ -13,7 +13,6 @@ from pathlib import Path
 
 import pytest
 
-from firmware_bridge.core.config import OPERATOR_SUFFIX
 from firmware_bridge.operate import operate
 from firmware_bridge.unitree.messages import ids
 from tests.support.processes import (
@@ -189,12 +188,27 @@ def test_the_runners_bridge_is_stopped_as_by_an_operator_and_its_run_ends(stack:
     assert operate("status", stack.bridge)[1]["blocked_by"] == "estop"
 
 
+DENIED = """
+import sys
+from firmware_bridge import operate
+from firmware_bridge.peer import BridgeUnavailable
+
+def denied(*_, **__):
+    raise BridgeUnavailable("no permission") from PermissionError()
+
+operate.BridgeClient = denied
+from edge.run.say import main
+sys.exit(main())
+"""
+"""`edge-say` of a user who may not reach the bridge: root, as whom tests may run, may always."""
+
+
 @pytest.mark.slow
 def test_without_a_bridge_that_this_user_can_reach_the_runner_stops_the_robot_itself(stack: Stack) -> None:
-    Path(f"{stack.bridge}{OPERATOR_SUFFIX}").unlink()
     with HostStall() as host, stack.drive() as runner:
         wait_for(stack.is_moving, 20, "the robot to be told to move")
-        done = stack.say("halt")
+        command = [sys.executable, "-c", DENIED, "halt", "--to", stack.instructions]
+        done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False, timeout=60)
         ended_ns = time.monotonic_ns()
         assert done.returncode == 0, done.stderr
         assert "no operator's stop was possible" in done.stdout
