@@ -113,6 +113,7 @@ class TestOrder:
         order = StampOrder()
         order.accept(state(5, received_ns=0))
         assert not any(order.accept(state(5, received_ns=k * S)) for k in range(1, 10))
+        assert not any(order.accept(state(5, received_ns=k * S)) for k in range(15, 60, 6)), "after a silence too"
 
     def test_a_stamp_from_the_future_does_not_hide_the_reports_after_it(self) -> None:
         order = StampOrder()
@@ -207,7 +208,11 @@ class TestDelay:
         assert all(order.accept(state(0, received_ns=k * S)) for k in range(1, 100))
         assert order.accept(state(1, received_ns=100 * S))
         assert order.accept(state(2, received_ns=100 * S + 1))
-        assert not order.accept(state(3, received_ns=100 * S + S * 9 // 10))
+
+    def test_a_report_after_the_first_nanosecond_of_a_clock_may_be_late_too(self) -> None:
+        order = StampOrder()
+        assert order.accept(state(1, received_ns=10 * S))
+        assert not order.accept(state(2, received_ns=10 * S + S * 9 // 10))
 
     def test_a_robot_that_begins_to_fill_in_stamps_late_is_believed(self) -> None:
         order = StampOrder()
