@@ -100,6 +100,12 @@ class Request:
     """Why there are no pins; empty with pins, and with --constraints."""
 
 
+def _release_number(text: str) -> int:
+    if not re.fullmatch(r"[1-9][0-9]{0,8}", text, re.ASCII):
+        raise argparse.ArgumentTypeError(f"expected the number of a release, from 1 on, found {text!r}")
+    return int(text)
+
+
 def add_parsers(commands: argparse._SubParsersAction[Any]) -> None:
     """Add the four sub-commands."""
     board = commands.add_parser("board", help="install or update: a new release beside the old, switched by a link")
@@ -124,7 +130,7 @@ def add_parsers(commands: argparse._SubParsersAction[Any]) -> None:
         "--keep", type=int, default=2, metavar="N", help="releases to keep beside the current one, at least 1 (2)"
     )
     back = commands.add_parser("rollback", help="switch back to the release before the current one, or to another")
-    back.add_argument("--to", type=int, metavar="N", help="number of the release (edge-install releases)")
+    back.add_argument("--to", type=_release_number, metavar="N", help="number of the release (edge-install releases)")
     listing = commands.add_parser("releases", help="list the releases of this board")
     listing.add_argument("--json", metavar="FILE|-", help="write the list as JSON")
     remove = commands.add_parser("remove", help="undo of board: remove every release and the link")

@@ -104,7 +104,7 @@ TABLE: Final = (
     ),
     _console(
         "edge-replay", "", "{folder}/none.mcap --artifacts {artifacts}",
-        {0: other_files(".mcap"), "--json": outputs, "--from": numbers("-1"), "--to": numbers("-1", "0"),
+        {0: other_files(".mcap"), "--json": outputs, "--from": numbers("-1"), "--to": texts("-1", "0", "nan", "abc", "", "0x10", "1,5", "--"),
          "--tolerance-cm": numbers("-1"), "--tolerance-deg": numbers("-1"), "--tolerance-command": numbers("-1")},
     ),
     _console(
@@ -191,9 +191,11 @@ TABLE: Final = (
          "--cluster": texts("", "nope", "nope:1", ":1", "127.0.0.1:1", "127.0.0.1:99999", "127.0.0.1:-1",
          "\x1b[2J:1"),
          "--json": outputs, "--out": output_directories, "--video": choices}, says=("address",),
+        preload=("sim_hil.benchmark.run_command",),
     ),
     _console("edge-bench", "latency", "--suite dynanav --policy artifacts:{artifacts}",
-        {"--latency": numbers("-1", "1e9", "profile:", "profile:/nope", "profile:/dev/zero")}),
+        {"--latency": numbers("-1", "1e9", "profile:", "profile:/nope", "profile:/dev/zero")},
+        preload=("sim_hil.benchmark.run_command",)),
     _console("edge-bench", "compare", "compare {folder}/a {folder}/b", {1: directories, "--json": outputs}),
     _console("edge-bench", "report", "report {folder}/a", {1: directories}),
     _console("edge-bench", "validate", "validate", {"--suite": toml_files, "--json": outputs},
