@@ -104,7 +104,8 @@ TABLE: Final = (
     ),
     _console(
         "edge-replay", "", "{folder}/none.mcap --artifacts {artifacts}",
-        {0: other_files(".mcap"), "--json": outputs, "--from": numbers("-1"), "--to": texts("-1", "0", "nan", "abc", "", "0x10", "1,5", "--"),
+        {0: other_files(".mcap"), "--json": outputs, "--from": numbers("-1"),
+         "--to": texts("-1", "0", "nan", "abc", "", "0x10", "1,5", "--"),
          "--tolerance-cm": numbers("-1"), "--tolerance-deg": numbers("-1"), "--tolerance-command": numbers("-1")},
     ),
     _console(
