@@ -48,6 +48,8 @@ class ModeWatch:
     def ask(self, kind: str, now_ns: int) -> None:
         """Note that the bridge requests a mode of this kind."""
         self._asked[kind] = now_ns
+        if kind != modes.DRIVE:
+            self._drive_ns = None  # the bridge itself ends the mode that it was given
 
     def accepted(self, *, arms: bool, now_ns: int) -> None:
         """Note that the autopilot has accepted to arm, or the drive mode."""

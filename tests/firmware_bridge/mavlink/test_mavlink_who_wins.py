@@ -59,6 +59,17 @@ def test_a_pilot_who_switches_back_before_the_next_heartbeat_keeps_the_rover(
     assert drive_requests(bench, since_ns) == 0 and bench.mode is Mode.MANUAL
 
 
+def test_a_stop_before_the_first_heartbeat_of_the_setpoint_mode_is_no_takeover() -> None:
+    bench = RoverBench(AUTOPILOTS["ardupilot"])
+    bench.speed, bench.to_bridge = (0.5, 0.0), once_a_second(bench)
+    bench.until(lambda: bench.mode is Mode.OFFBOARD, 20.0, "the setpoint mode")
+    bench.run(0.1)
+    bench.asking, bench.operator = False, [Stop()]
+    bench.run(3.0)
+    assert bench.mode is Mode.HOLD
+    assert not any("changed without the bridge" in line for line in bench.lines)
+
+
 @pytest.mark.parametrize("number", [SET_MODE, ARM_DISARM])
 def test_a_command_that_is_lost_is_sent_again_once_a_heartbeat_shows_no_effect(number: int) -> None:
     bench, lost = RoverBench(AUTOPILOTS["ardupilot"]), []
