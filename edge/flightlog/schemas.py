@@ -92,6 +92,7 @@ SCHEMAS: Mapping[str, Schema] = {
             "turn",
             "turn_left_m",
             "turn_may_be_done",
+            "keeps_form",
             "overruled",
             "planned",
             "stop",
@@ -115,6 +116,7 @@ SCHEMAS: Mapping[str, Schema] = {
         turn=_TEXT_OR_NULL,  # left or right: the turn that was next then
         turn_left_m=_VECTOR_OR_NULL,  # its distance by each earlier observation
         turn_may_be_done=_BOOL,  # whether the robot can have made it, by odometry
+        keeps_form=_BOOL,  # whether situation and plan were kept within the grammar
         overruled=_BOOL,  # whether the model would have decoded another progress
         planned=_TEXT,  # the plan's line as the model decoded it, where another distance was required
         stop=_VECTOR_OR_NULL,  # (x m, y m, θ rad) in the odometry's frame: where the answers mean to stop

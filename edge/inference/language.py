@@ -24,6 +24,7 @@ from edge.inference.graph import DTYPES, CancelledError, Graph, GraphError, Inte
 from edge.inference.scheduling import Schedule, run_as
 from edge.inference.speculation import FIRST_TEXT, Speculator, TextUnderWay, exact_calls_ns, most_rows, next_rows
 from edge.reasoning.decoding_rules import DecodingContext, TextConstraint
+from edge.reasoning.line_constraint import TextForms
 from edge.reasoning.prompt import (
     EXAMPLE_BEFORE,
     EXAMPLE_PAST_PATH,
@@ -113,6 +114,7 @@ class LanguageModel:
             runtime.im_start_id, runtime.im_end_id, runtime.img_start_id, runtime.img_end_id, runtime.img_context_id
         )
         self.prompt = PromptBuilder(self.tokenizer, ids, runtime.frame_tokens)
+        self._forms = TextForms(self.encode)
         buffers = {
             cache.name: ort.OrtValue.ortvalue_from_shape_and_type(
                 [axis if isinstance(axis, int) else runtime.max_context for axis in cache.shape],
@@ -151,7 +153,7 @@ class LanguageModel:
 
     def constraint(self, context: DecodingContext) -> TextConstraint:
         """Return the constraint of one generation's text by a context."""
-        return TextConstraint(context, self.encode)
+        return TextConstraint(context, self.encode, self._forms)
 
     def encode(self, text: str) -> list[int]:
         """Return the tokens of a text."""

@@ -1,12 +1,13 @@
 """Rules that constrain how a text is decoded, by earlier texts and by odometry (ours; the paper decodes freely).
 
-Three rules, all off with `--decoding free`, the paper's greedy decoding:
+Four rules, all off with `--decoding free`, the paper's greedy decoding:
 
 * Progress: the number of turns stays, a turn is followed by itself or by the next one, and a turn is undone only when
   the model chooses so twice in a row.
 * Turn distance: the planned turn is no further away than the median of the last observations of it, each less what the
   robot has driven since.
 * Turn done: a turn to a side is done once odometry has seen the robot rotate to that side.
+* Form: situation and plan follow the grammar.
 
 A replaced token or line is fed to the model, so the rest of the text and the action expert follow it.
 """
@@ -15,13 +16,12 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import takewhile
 from statistics import median
-from typing import Any, Final, TypeAlias
+from typing import Any, Final
 
 from edge.core.geometry import SE2, wrap_angle
+from edge.reasoning.line_constraint import Encode, FormConstraint, Line, LineConstraint, TextForms
 from edge.state.reasoning_text import (
     AHEAD,
     LEFT,
@@ -38,9 +38,6 @@ from edge.state.reasoning_text import (
     parse_text,
 )
 from edge.state.ring import EncodedFrame
-
-Line: TypeAlias = tuple[int, ...]
-Encode: TypeAlias = Callable[[str], Sequence[int]]
 
 FREE: Final = "free"
 """Any progress: there is no earlier one, or the rules are off."""
@@ -119,6 +116,8 @@ class DecodingContext:
     turn: TurnDistances | None = None
     turn_may_be_done: bool = True
     """Whether the robot can have made the next turn."""
+    keeps_form: bool = False
+    """Whether situation and plan follow the grammar."""
 
     def after(self, text: str, constraint: TextConstraint) -> DecodingContext:
         """Return the context after a text that this one constrained, but for the turn.
@@ -133,7 +132,7 @@ class DecodingContext:
         """Return the flight log's fields, beside `before`."""
         side, distances_m = (None, None) if self.turn is None else (self.turn.side, self.turn.distances_m)
         return {"follow": self.follow, "turn": side, "turn_left_m": distances_m,
-                "turn_may_be_done": self.turn_may_be_done}  # fmt: skip
+                "turn_may_be_done": self.turn_may_be_done, "keeps_form": self.keeps_form}  # fmt: skip
 
 
 def allowed_progress(before: Progress, follow: str) -> tuple[Progress, ...]:
@@ -156,59 +155,18 @@ def allowed_progress(before: Progress, follow: str) -> tuple[Progress, ...]:
     )
 
 
-class LineConstraint:
-    """Constrains one line of a text to some lines of tokens, the first of them preferred.
-
-    The line begins where the model chooses their common first token. Where the model chooses a token that none of the
-    remaining lines has, the preferred remaining line replaces its choice. A text without such a line is unchanged.
-    """
-
-    def __init__(self, lines: Sequence[Line], refused: Mapping[str, Sequence[Line]] | None = None) -> None:
-        """`lines`: one token or more each, none the start of another; `refused`: lines that are not allowed, by kind.
-
-        Raises ValueError unless all lines begin with the same token.
-        """
-        if len({line[:1] for line in lines}) != 1 or not lines[0]:
-            raise ValueError("expected lines that begin with the same token")
-        self._lines = list(lines)
-        self._refused = {name: list(kind) for name, kind in (refused or {}).items()}
-        self._at = 0
-        self.overruled = False
-        """Whether a choice of the model was replaced."""
-        self.refused: str | None = None
-        """Kind of the refused line that the model began; None for another line."""
-
-    def choose(self, token: int) -> int:
-        """Return the token to take where the model chooses `token`; call it for every new token, in order."""
-        if not self._lines or (self._at == 0 and token != self._lines[0][0]):
-            return token
-        allowed = [line for line in self._lines if line[self._at] == token]
-        for name, kind in self._refused.items():
-            self._refused[name] = [line for line in kind if line[self._at : self._at + 1] == (token,)]
-        if not allowed:
-            if not self.overruled:
-                # Later tokens follow the replaced one, not the model's own choice.
-                self.refused = next((name for name, kind in self._refused.items() if kind), None)
-            self.overruled = True
-            allowed = self._lines[:1]
-            token = allowed[0][self._at]
-        self._at += 1
-        self._lines = [line for line in allowed if len(line) > self._at]
-        return token
-
-    def forced(self) -> Line:
-        """Return the next tokens that `choose` will return whatever the model chooses."""
-        rest = [line[self._at :] for line in self._lines] if self._at else []
-        same = takewhile(lambda column: len(set(column)) == 1, zip(*rest, strict=False))
-        return tuple(column[0] for column in same)
-
-
 class TextConstraint:
     """Constrains one text to a context: `choose` for every token, `replace_line` for every line."""
 
-    def __init__(self, context: DecodingContext, encode: Encode) -> None:
-        """`encode` returns the model's tokens of a text."""
+    def __init__(self, context: DecodingContext, encode: Encode, forms: TextForms | None = None) -> None:
+        """`encode` returns the model's tokens of a text; `forms`: what a context that keeps the form needs.
+
+        Raises ValueError if it has none.
+        """
+        if context.keeps_form and forms is None:
+            raise ValueError("expected the forms of situation and plan for a context that keeps them")
         self._context = context
+        self._form = FormConstraint(forms) if context.keeps_form and forms is not None else None
         self._encode = encode
         self._progress_line = self._constrain_progress()
         self._progress: Progress | None = None
@@ -231,11 +189,13 @@ class TextConstraint:
 
     def choose(self, token: int) -> int:
         """Return the token to take where the model chooses `token`."""
-        return token if self._progress_line is None else self._progress_line.choose(token)
+        token = token if self._progress_line is None else self._progress_line.choose(token)
+        return token if self._form is None else self._form.choose(token)
 
     def forced(self) -> Line:
         """Return the next tokens that the context forces."""
-        return () if self._progress_line is None else self._progress_line.forced()
+        forced = () if self._progress_line is None else self._progress_line.forced()
+        return forced if forced or self._form is None else self._form.forced()
 
     def replace_line(self, line: str) -> Line | None:
         """Return the tokens, line end included, that replace a complete line; None to keep it."""

@@ -108,8 +108,8 @@ class InstructionMemory:
             return DecodingContext(self._context.before)
         turn = self._turn
         return replace(
-            self._context, turn=turn.distances(anchor.T_odom_base), turn_may_be_done=turn.may_be_done
-        )  # fmt: skip
+            self._context, turn=turn.distances(anchor.T_odom_base), turn_may_be_done=turn.may_be_done, keeps_form=True
+        )
 
     def watch(self, ring: TokenRing) -> None:
         """Take the ring's new poses, at most about once a second; call it more often than the ring is long."""

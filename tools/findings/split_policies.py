@@ -16,14 +16,8 @@ from numpy.typing import NDArray
 
 from edge.core.geometry import SE2
 from edge.inference.language import LanguageModel
-from edge.reasoning.decoding_rules import (
-    DecodingContext,
-    Encode,
-    Line,
-    LineConstraint,
-    TextConstraint,
-    observed_turn,
-)
+from edge.reasoning.decoding_rules import DecodingContext, TextConstraint, observed_turn
+from edge.reasoning.line_constraint import Encode, Line, LineConstraint
 from edge.state.reasoning_text import (
     OBJECTS_HEAD,
     PLAN_HEAD,

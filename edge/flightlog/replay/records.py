@@ -168,6 +168,7 @@ def _generation(payload: Mapping[str, Any]) -> RecordedGeneration:
             _follow(payload.get("follow", FREE)),
             _turn(payload.get("turn"), payload.get("turn_left_m")),
             _flag(payload.get("turn_may_be_done", True)),
+            _flag(payload.get("keeps_form", False)),
         ),
         # Without the recorded cap: use the text's own token count, which gives the same keys and values.
         max_new_tokens=int(payload.get("max_new_tokens", payload["new_tokens"])),

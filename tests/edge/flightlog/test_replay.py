@@ -256,13 +256,13 @@ def test_a_generation_is_decoded_under_its_recorded_constraint(log: Log, monkeyp
         return constraint(self, context)
 
     monkeypatch.setattr(LanguageModel, "constraint", watched)
-    fields = {"turn": "left", "turn_left_m": [2.5, 3.0], "turn_may_be_done": False}
+    fields = {"turn": "left", "turn_left_m": [2.5, 3.0], "turn_may_be_done": False, "keeps_form": True}
     log.payload("/semantic", 1).update(before="turn 1 of 3, passed 1.", follow=EITHER_WAY, **fields)
     for field in (*fields, "before", "follow"):
         log.payload("/semantic", 2).pop(field, None)
     log.replay()
     turn = TurnDistances("left", (2.5, 3.0))
-    assert asked[1] == DecodingContext(Progress(1, 3, 1), EITHER_WAY, turn, turn_may_be_done=False)
+    assert asked[1] == DecodingContext(Progress(1, 3, 1), EITHER_WAY, turn, turn_may_be_done=False, keeps_form=True)
     assert asked[2] == DecodingContext(None), "a log from before there were constraints"
 
 

@@ -25,7 +25,8 @@ from edge.inference.speculation import (
     most_rows,
     next_rows,
 )
-from edge.reasoning.decoding_rules import EITHER_WAY, ONWARD, DecodingContext, LineConstraint, TurnDistances
+from edge.reasoning.decoding_rules import EITHER_WAY, ONWARD, DecodingContext, TurnDistances
+from edge.reasoning.line_constraint import LineConstraint
 from edge.reasoning.prompt import Segment
 from edge.state.reasoning_text import Progress, parse_text
 from tests.edge.inference.test_language import SENTENCE, frames

@@ -17,7 +17,6 @@ from edge.reasoning.decoding_rules import (
     FREE,
     ONWARD,
     DecodingContext,
-    LineConstraint,
     TextConstraint,
     TurnDistances,
     TurnObservation,
@@ -52,51 +51,6 @@ def test_free_is_free_and_an_unknown_rule_is_refused() -> None:
     assert allowed_progress(Progress(1, 2, 0), FREE) == ()
     with pytest.raises(ValueError, match="backwards"):
         allowed_progress(Progress(1, 2, 0), "backwards")
-
-
-# The line: 7 begins it.
-
-LINES = [(7, 1, 2, 9), (7, 1, 3, 9), (7, 4, 9)]
-
-
-def chosen(constraint: LineConstraint, *tokens: int) -> list[int]:
-    return [constraint.choose(token) for token in tokens]
-
-
-@pytest.mark.parametrize("line", LINES)
-def test_a_line_that_is_allowed_is_left_alone(line: tuple[int, ...]) -> None:
-    constraint = LineConstraint(LINES)
-    assert chosen(constraint, 5, 5, *line, 7, 8, 6) == [5, 5, *line, 7, 8, 6]
-    assert not constraint.overruled
-
-
-@pytest.mark.parametrize(
-    ("lines", "tokens", "expected"),
-    [
-        (LINES, (7, 8, 8, 8, 8), [7, 1, 2, 9, 8]),
-        (LINES[:2], (7, 8, 3, 9), [7, 1, 2, 9]),
-        (LINES, (7, 4, 8, 6), [7, 4, 9, 6]),
-    ],
-    ids=["preferred line", "also where the model would rejoin another one", "what was chosen so far is kept"],
-)
-def test_a_token_that_no_line_has_there_is_replaced(
-    lines: list[tuple[int, ...]], tokens: tuple[int, ...], expected: list[int]
-) -> None:
-    constraint = LineConstraint(lines)
-    assert chosen(constraint, *tokens) == expected and constraint.overruled
-
-
-def test_a_text_without_the_line_is_left_alone() -> None:
-    constraint = LineConstraint(LINES)
-    assert chosen(constraint, 1, 2, 3, 9) == [1, 2, 3, 9] and not constraint.overruled
-
-
-def test_lines_that_begin_differently_are_no_guide() -> None:
-    with pytest.raises(ValueError, match="same token"):
-        LineConstraint([(1, 2), (2, 2)])
-
-
-# The text
 
 
 def letters(text: str) -> list[int]:

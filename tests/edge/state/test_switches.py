@@ -9,6 +9,7 @@ from edge.core.geometry import SE2
 from edge.motion.recovery import ARRIVED
 from edge.reasoning.decoding_rules import FREE, DecodingContext, TextConstraint
 from edge.reasoning.instruction_state import InstructionMemory
+from edge.reasoning.line_constraint import TextForms
 from edge.run import command as runner
 from edge.state.ring import EncodedFrame
 from edge.state.switches import Decoding, RecoverySwitch, Speculation, Switches, SwitchOptions
@@ -64,12 +65,16 @@ def test_standing_at_the_goal_without_recovery_is_refused_in_one_line() -> None:
 TEXT = "Progress: turn 2 of 3, passed 0.\nPlan: turn left into the room in 6 m.\nwaypoints: (1.0, 0.0) (2.0, 0.0)"
 
 
+def letters(text: str) -> list[int]:
+    return [ord(letter) for letter in text]
+
+
 def context_after_a_text(decoding: Decoding) -> DecodingContext:
     memory, frame = (
         InstructionMemory(None, "go", decoding),
         EncodedFrame(10**9, SE2(0.0, 0.0, 0.0), np.zeros(1, np.float32)),
     )
-    constraint = TextConstraint(memory.context(frame), lambda text: [ord(letter) for letter in text])
+    constraint = TextConstraint(memory.context(frame), letters, TextForms(letters))
     for line in TEXT.split("\n"):
         constraint.replace_line(line)
     memory.update(TEXT, constraint, frame)
@@ -78,13 +83,13 @@ def context_after_a_text(decoding: Decoding) -> DecodingContext:
 
 def test_constrained_decoding_knows_the_turn_and_what_may_follow() -> None:
     context = context_after_a_text(CONSTRAINED)
-    assert context.turn is not None and not context.turn_may_be_done and context.follow != FREE
+    assert context.turn is not None and not context.turn_may_be_done and context.follow != FREE and context.keeps_form
 
 
 def test_free_decoding_gives_the_prompt_its_progress_and_constrains_nothing() -> None:
     context = context_after_a_text(Decoding.FREE)
     assert context == DecodingContext(context_after_a_text(CONSTRAINED).before)
-    constraint = TextConstraint(context, lambda text: [ord(letter) for letter in text])
+    constraint = TextConstraint(context, letters)
     answer = "Progress: last leg of 9, passed 0.\n"
     assert "".join(chr(constraint.choose(ord(letter))) for letter in answer) == answer
     assert constraint.replace_line("Plan: turn left into the room in 9 m.") is None

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from edge.reasoning.decoding_rules import DecodingContext, Encode, Line, TextConstraint, TurnDistances
+from edge.reasoning.decoding_rules import DecodingContext, TextConstraint, TurnDistances
+from edge.reasoning.line_constraint import Encode, Line
 from edge.state.reasoning_text import Progress
 
 

@@ -20,6 +20,7 @@ from tokenizers import Tokenizer
 
 from edge.core.geometry import SE2
 from edge.reasoning.decoding_rules import DecodingContext, TextConstraint
+from edge.reasoning.line_constraint import TextForms
 from edge.reasoning.path_memory import FARTHEST_M, MAX_POINTS, PastPath, PathMemory
 from edge.reasoning.prompt import PromptBuilder, PromptIds, Segment
 from edge.state.reasoning_text import (
@@ -287,6 +288,7 @@ class Prompts:
         # Token ids depend on the number of frames, not on their content.
         self._frame = EncodedFrame(0, SE2(0.0, 0.0, 0.0), np.zeros((1, 1, 1), np.float32))
         self._start = self._encode(WAYPOINTS_START)
+        self._forms: TextForms | None = None
 
     def prompt(self, anchor: Anchor, drawn: Drawn) -> tuple[int, ...]:
         """Return the ids before the answer. Raises InstructionError for an invalid wording."""
@@ -312,7 +314,9 @@ class Prompts:
 
     def constraint(self, context: DecodingContext) -> TextConstraint:
         """Return what the runner constrains an answer with."""
-        return TextConstraint(context, self._encode)
+        if self._forms is None and context.keeps_form:
+            self._forms = TextForms(self._encode)
+        return TextConstraint(context, self._encode, self._forms)
 
     def text(self, ids: Iterable[int]) -> str:
         """Decode answer tokens, as the runner does."""

@@ -18,7 +18,8 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
-from edge.reasoning.decoding_rules import LineConstraint, TextConstraint
+from edge.reasoning.decoding_rules import TextConstraint
+from edge.reasoning.line_constraint import LineConstraint
 from export.model.language import DecoderLayer, LanguageModel, RmsNorm, rotate
 from export.model.vision import fold_tokens
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from edge.reasoning.decoding_rules import LineConstraint
+from edge.reasoning.line_constraint import LineConstraint
 from export.model.config import PRESETS, TicVlaConfig
 from export.model.language import LanguageModel
 from export.model.network import build
