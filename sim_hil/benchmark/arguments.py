@@ -97,6 +97,10 @@ def parser() -> argparse.ArgumentParser:
         help="control experiment: give every task the instruction of another task in the same scene",
     )
     p.add_argument(
+        "--turn-starts", type=int, metavar="SEED",
+        help="begin with random headings; the instruction says how to turn where the route is not ahead",
+    )  # fmt: skip
+    p.add_argument(
         "--decoding", choices=[each.value for each in Decoding],
         help="decoding of an artifact policy: greedy as in the paper (free), or within rules (default: the manifest's)",
     )  # fmt: skip
@@ -172,6 +176,7 @@ def conditions_of(args: argparse.Namespace) -> Conditions:
         wording=args.wording,
         wordings=args.wordings,
         swap_instructions=args.swap_instructions,
+        turn_starts=args.turn_starts,
         decoding=args.decoding,
         recovery=args.recovery,
         speculation=args.speculation,

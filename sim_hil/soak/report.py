@@ -110,6 +110,7 @@ def _headline(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [
         (f"{result['elapsed_s'] / 60:.1f} min", f"in {len(legs)} legs"),
         (f"{reached} of {tasks}", "tasks reached"),
+        (shown("success_ahead_percent", 0), "reached of those whose route began ahead"),
         (shown("collision_percent", 0), "of tasks with a contact"),
         (shown("tick_ms.p999"), f"tick p99.9 of {measures['tick_ms.p999']['count']}"),
         (shown("missed_percent", 3), "ticks missed"),

@@ -12,7 +12,7 @@ import numpy as np
 from sim_hil.benchmark.env.metrics import spl
 from sim_hil.benchmark.language.instructions import WordingError, wordings
 from sim_hil.benchmark.language.route import RouteError
-from sim_hil.benchmark.language.tasks import goal_before, goals, make_task, sample_task
+from sim_hil.benchmark.language.tasks import facing, goal_before, goals, make_task, sample_task
 from sim_hil.benchmark.suite.build import timeout_s
 from sim_hil.benchmark.suite.robots import robot_grid
 from sim_hil.realtime.truth import TruePose
@@ -28,7 +28,10 @@ _SLOW: Final = 0.6  # mean speed among people as a share of the speed limit
 
 @dataclass(frozen=True)
 class SoakTask:
-    """Task to drive from `start` (x m, y m, heading rad) to `goal_xy` (m); `shortest_m`: shortest feasible path."""
+    """Task to drive from `start` (x m, y m, heading rad) to `goal_xy` (m); `shortest_m`: shortest feasible path.
+
+    `first`: how the robot must turn on the spot to face its route (`tasks.facing`). A detailed instruction says so.
+    """
 
     number: int
     instruction: str
@@ -37,6 +40,7 @@ class SoakTask:
     goal_label: str
     shortest_m: float
     timeout_s: float
+    first: str = ""
 
 
 class Journey:
@@ -90,25 +94,25 @@ class Journey:
                     task = make_task(self.scene, self._grid, begin, thing)
                     length_m = gap_m + _length_m(task.path)
                     if lengths_m[0] <= length_m <= lengths_m[1]:
-                        return self._task(
-                            at, task.goal, thing, length_m, wordings(task.route, 1, seed, held_out=True)[0]
-                        )
+                        first = facing(begin, task.path)
+                        text = wordings(task.route, 1, seed, held_out=True, first=first)[0]
+                        return self._task(at, task.goal, thing, length_m, text, first)
                 except (RouteError, WordingError):
                     continue
         for thing in order:
             goal = goal_before(self._grid, thing)
             path = None if goal is None else self._grid.path((begin[0], begin[1]), goal)
-            length_m = 0.0 if path is None else gap_m + _length_m(tuple(path))
-            if goal is not None and length_m >= LENGTH_M[0]:
-                return self._task(at, goal, thing, length_m, f"Go to the {thing.landmark}.")
+            if goal is None or path is None or (length_m := gap_m + _length_m(tuple(path))) < LENGTH_M[0]:
+                continue
+            return self._task(at, goal, thing, length_m, f"Go to the {thing.landmark}.", facing(begin, path))
         return None
 
-    def _task(self, at: Vec3, goal: Vec2, thing: SceneObject, length_m: float, text: str) -> SoakTask:
+    def _task(self, at: Vec3, goal: Vec2, thing: SceneObject, length_m: float, text: str, first: str) -> SoakTask:
         self._count += 1
         # The benchmark's, so that rates of success compare; a speed limit below its robots' needs more.
         outdoor = self.scene.ceiling_height_m == 0
         longest_s = max(timeout_s(length_m, self._people, outdoor), 20.0 + length_m / (_SLOW * self._speed_mps))
-        return SoakTask(self._count, text, at, goal, thing.label, length_m, longest_s)
+        return SoakTask(self._count, text, at, goal, thing.label, length_m, longest_s, first)
 
 
 def _length_m(path: tuple[Vec2, ...]) -> float:
@@ -158,4 +162,5 @@ class TaskRun:
             "collisions": sorted(self._touched),
             "goal": task.goal_label,
             "instruction": task.instruction,
+            "first": task.first,
         }

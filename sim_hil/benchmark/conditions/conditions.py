@@ -81,6 +81,8 @@ class Conditions:
     wordings: str = "benchmark"
     swap_instructions: int | None = None
     """Seed of the permutation that gives every task the instruction of another task in its scene; None: its own."""
+    turn_starts: int | None = None
+    """Seed of the random headings with which the robots begin; None: along their routes, as the suite has it."""
     decoding: str | None = None
     """Decoding of an artifact policy's texts; None: the manifest's."""
     recovery: str | None = None
@@ -109,6 +111,10 @@ class Conditions:
             _one_of("robot", self.robot, tuple(ROBOTS))
         if self.swap_instructions is not None and not 0 <= self.swap_instructions < 2**31:
             raise ConditionsError(f"swapped instructions: expected a seed from 0, found {self.swap_instructions}")
+        if self.turn_starts is not None and not 0 <= self.turn_starts < 2**31:
+            raise ConditionsError(f"turned starts: expected a seed from 0, found {self.turn_starts}")
+        if self.turn_starts is not None and self.swap_instructions is not None:
+            raise ConditionsError("turned starts: expected without swapped instructions, found both; choose one")
         kind = self.policy.kind
         if self.mode is not None:
             _one_of("mode", self.mode, MODES)
@@ -202,6 +208,8 @@ class Conditions:
             parts.append(f"{self.wordings} wordings")
         if self.swap_instructions is not None:
             parts.append(f"instructions swapped by {self.swap_instructions}")
+        if self.turn_starts is not None:
+            parts.append(f"starts turned by {self.turn_starts}")
         parts += [f"{name} {value}" for name, value in self._switches_by_name if value]
         if self.stays:
             parts.append("halts at its own stop")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from sim_hil.benchmark.language.instruction_words import AREAS, NAME, ORDINALS
+from sim_hil.benchmark.language.instruction_words import AREAS, AROUND, NAME, ORDINALS
 from sim_hil.benchmark.language.openings import opening_class
 from sim_hil.benchmark.language.route import RouteDescription, Step
 
@@ -24,7 +24,7 @@ _BESIDE = "(?:on|to) (?:the|your)"
 
 @dataclass(frozen=True)
 class Claim:
-    """One claim of a sentence; `kind`: turn, cross, pass, leave, end or goal; missing details are "" or 0."""
+    """One claim of a sentence; `kind`: face, turn, cross, pass, leave, end or goal; missing details are "" or 0."""
 
     kind: str
     side: str = ""
@@ -36,6 +36,10 @@ class Claim:
 
 # In the order in which they are tried: s = side, c = count, n = object, a = area.
 _PATTERNS: tuple[tuple[str, str, str], ...] = (
+    ("face", rf"turn {_SIDE} on the spot", "s"),
+    ("face", rf"turn on the spot to the {_SIDE}", "s"),
+    ("face", rf"turn to face {_SIDE}", "s"),
+    ("around", r"turn (?:around|round)", ""),
     ("pass", rf"(?:pass|past|keep) the {_NAME} on (?:the|your) {_SIDE}", "ns"),
     ("turn end", rf"{_TURN} {_SIDE} at the end of the {_CORRIDOR}", "s"),
     ("turn end", rf"at the end of the {_CORRIDOR} {_TURN} {_SIDE}", "s"),
@@ -92,9 +96,9 @@ def _claim(kind: str, values: dict[str, str | None]) -> Claim:
     verb, _, detail = kind.partition(" ")
     count = values.get("c")
     name = values.get("n") or values.get("a") or ""
-    side = "straight" if verb == "straight" else values.get("s") or ("straight" if verb == "cross" else "")
+    side = values.get("s") or {"straight": "straight", "cross": "straight", "around": AROUND}.get(verb, "")
     return Claim(
-        "turn" if verb == "straight" else verb,
+        {"straight": "turn", "around": "face"}.get(verb, verb),
         side,
         ORDINALS.index(count) + 1 if count else 0,
         detail if detail not in ("end", "") else "",
@@ -103,8 +107,11 @@ def _claim(kind: str, values: dict[str, str | None]) -> Claim:
     )
 
 
-def untrue(text: str, route: RouteDescription) -> list[str]:
-    """Return the false or missing claims of an instruction about a route, one line each; empty if it is correct."""
+def untrue(text: str, route: RouteDescription, first: str = "") -> list[str]:
+    """Return the false or missing claims of an instruction about a route, one line each; empty if it is correct.
+
+    `first`: how the robot must turn on the spot before the route begins (`tasks.facing`).
+    """
     try:
         claims = read(text)
     except ValueError as error:
@@ -112,8 +119,12 @@ def untrue(text: str, route: RouteDescription) -> list[str]:
     problems: list[str] = []
     steps = [s for s in route.steps if not (s.side == "straight" and s.kind in ("sidewalk", "corridor", "aisle"))]
     taken = 0
+    if first and not route.leaves_room and not any(claim.kind == "face" for claim in claims):
+        problems.append(f"does not say that the robot must turn {first} on the spot")
     for claim in claims:
-        if claim.kind in ("turn", "cross"):
+        if claim.kind == "face" and claim.side != first:
+            problems.append(f"turn on the spot: expected {first or 'none'}, found {claim.side}")
+        elif claim.kind in ("turn", "cross"):
             if taken >= len(steps):
                 problems.append(f"one turn too many: {claim.side}")
                 continue

@@ -12,6 +12,8 @@ AREAS = (
 COLOUR_WORDS = frozenset(
     ("red", "blue", "green", "yellow", "orange", "purple", "white", "black", "brown", "pink", "grey")
 )
+AROUND = "around"
+"""The turn on the spot before a route that begins behind the robot; before others it is a side, or "" if ahead."""
 ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth")
 # Names of landmarks: those of all kinds, and additional names used in scenes.
 NOUNS = tuple(sorted({kind.noun for kind in KINDS.values()} | {"exit door", "desk", "umbrella"}, key=len, reverse=True))

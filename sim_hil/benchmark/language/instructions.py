@@ -12,7 +12,7 @@ import re
 
 import numpy as np
 
-from sim_hil.benchmark.language.instruction_words import AREAS, NAME, ORDINALS
+from sim_hil.benchmark.language.instruction_words import AREAS, AROUND, NAME, ORDINALS
 from sim_hil.benchmark.language.route import Passed, RouteDescription, Step
 
 HELD_OUT_SHARE = 0.2  # share of the sentence patterns that is reserved for the benchmark
@@ -45,16 +45,17 @@ class _Writer:
         return bool(self.rng.uniform() < share)
 
 
-def wordings(route: RouteDescription, count: int, seed: int, *, held_out: bool) -> list[str]:
+def wordings(route: RouteDescription, count: int, seed: int, *, held_out: bool, first: str = "") -> list[str]:
     """Return `count` different wordings of a route, from the benchmark's patterns (`held_out`) or training's.
 
-    Deterministic per seed. Raises WordingError if the grammar does not yield enough.
+    `first`: how the robot must turn on the spot before the route begins, as `tasks.facing` gives it. Deterministic per
+    seed. Raises WordingError if the grammar does not yield enough.
     """
     rng = np.random.default_rng((seed, 5))
     found: list[str] = []
     patterns: set[str] = set()
     for attempt in range(400 + 60 * count):
-        text = _compose(_Writer(rng), route)
+        text = _compose(_Writer(rng), route, first)
         if len(text.split()) > MAX_WORDS or is_held_out(text) != held_out or text in found:
             continue
         # Prefer a new pattern for each, because wordings that differ in one word add little.
@@ -80,8 +81,8 @@ def is_held_out(text: str) -> bool:
     return int.from_bytes(digest[:4], "big") < HELD_OUT_SHARE * 2**32
 
 
-def _compose(w: _Writer, route: RouteDescription) -> str:
-    clauses = _steps(w, route)
+def _compose(w: _Writer, route: RouteDescription, first: str) -> str:
+    clauses = [*_turn_on_the_spot(w, route, first), *_steps(w, route)]
     goal = route.goal_bare if w.chance(0.5) else route.goal_name
     style = w.pick("route", "route", "route", "goal", "short")
     if style == "goal":
@@ -186,6 +187,15 @@ def _stop(w: _Writer, route: RouteDescription, goal: str) -> str:
         f"keep going until you reach the {goal}", f"go on until you are at the {goal}",
         f"stop when you get to the {goal}", f"stop once you have reached the {goal}", f"come to a halt by the {goal}",
     )  # fmt: skip
+
+
+def _turn_on_the_spot(w: _Writer, route: RouteDescription, first: str) -> list[str]:
+    """Return the clause by which the robot faces its route; one in a room is often told to leave it, and no more."""
+    if not first or (route.leaves_room and (first != AROUND or w.chance(0.5))):
+        return []
+    if first == AROUND:
+        return [w.pick("turn around", "turn round")]
+    return [w.pick(f"turn {first} on the spot", f"turn on the spot to the {first}", f"turn to face {first}")]
 
 
 def _steps(w: _Writer, route: RouteDescription) -> list[str]:

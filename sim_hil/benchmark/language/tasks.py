@@ -9,6 +9,7 @@ from math import atan2, cos, hypot, pi, sin
 
 import numpy as np
 
+from sim_hil.benchmark.language.instruction_words import AROUND
 from sim_hil.benchmark.language.openings import LINEAR, bounds_of, dense
 from sim_hil.benchmark.language.route import RouteDescription, RouteError, describe_route
 from sim_hil.scene.nav_grid import NavGrid
@@ -167,12 +168,20 @@ def _facing(task: Task) -> Task:
     return task
 
 
+def facing(start: Vec3, path: Sequence[Vec2]) -> str:
+    """Return how a robot must turn on the spot to face its path: "" (it begins ahead), "left", "right" or AROUND."""
+    bearing = _wrapped(_first_direction(path) - start[2])
+    if abs(bearing) <= pi / 3:
+        return ""
+    return AROUND if abs(bearing) >= 2 * pi / 3 else "left" if bearing > 0 else "right"
+
+
 def begins_ahead(task: Task) -> bool:
     """Return whether the route begins ahead of the robot; only then an instruction may begin with "go on"."""
-    return abs(_wrapped(_first_direction(task.path) - task.start[2])) <= pi / 3
+    return not facing(task.start, task.path)
 
 
-def _first_direction(path: tuple[Vec2, ...]) -> float:
+def _first_direction(path: Sequence[Vec2]) -> float:
     """Return the direction of a path's first two metres, rad."""
     left, at = 2.0, path[0]
     for a, b in itertools.pairwise(path):

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from math import hypot
+from math import hypot, pi
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from sim_hil.benchmark.language.instruction_words import AROUND
 from sim_hil.benchmark.suite.robots import footprint_m, robot_grid
 from sim_hil.realtime.truth import TruePose, TruthTail
 from sim_hil.scene.nav_grid import NavGrid
@@ -33,6 +34,16 @@ def test_a_task_begins_at_the_robot_and_has_a_feasible_path(office: Scene) -> No
         assert LENGTH_M[0] <= task.shortest_m <= LENGTH_M[1]
         assert task.shortest_m == pytest.approx(grid.distance_m((at[0], at[1]), task.goal_xy), rel=0.03)
         at = (*task.goal_xy, 0.0)
+
+
+@pytest.mark.slow
+def test_a_robot_that_does_not_face_its_route_is_told_to_turn_around(office: Scene) -> None:
+    for heading, first in ((0.0, ""), (pi, AROUND)):
+        tasks = [Journey(office, seed, leg=1, speed_mps=0.8).next((14.0, 10.6, heading)) for seed in (1, 2)]
+        assert [None if task is None else task.first for task in tasks] == [first, first]
+        # It stands in a room, which it may just be told to leave.
+        told = [task is not None and "turn around" in task.instruction for task in tasks]
+        assert any(told) == bool(first)
 
 
 @pytest.mark.slow

@@ -119,10 +119,14 @@ def messages(job: Message) -> Iterator[Mapping[str, Any]]:
 def _of_layout(order: Order, numbers: range, size: int) -> Iterator[Mapping[str, Any]]:
     """Record some of the `size` drives of one layout; yield the messages of each."""
     kinds = order.config.kinds or SHARES
+    turned_share = (order.tour or order.config).turned_share
     try:
         scenarios = list(
-            training_episodes(order.scenario_seed, len(numbers), kinds, start=numbers[0], tasks_per_scene=size)
-        )
+            training_episodes(
+                order.scenario_seed, len(numbers), kinds, start=numbers[0], tasks_per_scene=size,
+                turned_share=turned_share,
+            )
+        )  # fmt: skip
     except ScenarioError:
         for number in numbers:
             yield {"dropped": order.id(number), "why": "no such layout"}

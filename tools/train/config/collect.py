@@ -66,6 +66,8 @@ class CollectConfig(Checked):
     into an opening near the correct one, the others to any other place."""
     stray_into_m: Annotated[float, Range(2, 20)] = 2.0
     """Greatest depth that the robot enters a wrong opening, m; drawn from 2 m on for each detour."""
+    turned_share: Share = 0.0
+    """Drives that begin with a random heading and not along the route; the instruction says how to turn."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -94,6 +96,8 @@ class TourConfig(Checked):
     """Longest detour to another place, m."""
     stray_into_m: Annotated[float, Range(2, 20)] = 2.0
     """Greatest depth that the robot enters a wrong opening, m; drawn from 2 m on for each detour."""
+    turned_share: Share = 0.0
+    """Tours that begin with a random heading and not along the route; the instruction says how to turn."""
     linger_s: Annotated[float, Range(0, 60)] = 5.0
     """Longest recording after arrival, s; each tour takes between half of it and all of it."""
 

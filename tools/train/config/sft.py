@@ -69,6 +69,8 @@ class RelabelConfig(Checked):
     """Random goals that are tried per drive or tour."""
     off_m: Annotated[float, Range(1, 20)] = 3.0
     """A relabel ends at this distance from its route, m: the farther, the more of it shows a robot that is lost."""
+    turned: bool = False
+    """Whether other routes may begin behind or beside the robot; their instructions begin with a turn on the spot."""
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import hypot, isfinite
+from math import hypot, isfinite, pi
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -18,7 +18,7 @@ from sim_hil.benchmark.language.instruction_reading import untrue
 from sim_hil.benchmark.language.instructions import WordingError, is_held_out, wordings
 from sim_hil.benchmark.language.route import RouteDescription, RouteError
 from sim_hil.benchmark.language.task_checks import named_landmarks, named_too_small, worst_leak, wrong_bends
-from sim_hil.benchmark.language.tasks import Task, goals, make_task, sample_task
+from sim_hil.benchmark.language.tasks import Task, facing, goals, make_task, sample_task
 from sim_hil.benchmark.language.visibility import Sightlines
 from sim_hil.benchmark.policies.expert_route import PlannerGround
 from sim_hil.benchmark.suite.build import timeout_s
@@ -206,10 +206,12 @@ def training_episodes(
     *,
     start: int = 0,
     tasks_per_scene: int = TASKS_PER_SCENE,
+    turned_share: float = 0.0,
 ) -> Iterator[Scenario]:
     """Yield scenarios number `start` to `start + count - 1` of a seed; `kinds` are shares of the layouts by kind.
 
-    Raises ScenarioError.
+    `turned_share`: probability that the robot's heading at the start is random and not along its route; the rest of a
+    scenario does not depend on it. Raises ScenarioError.
     """
     if not 0 <= seed <= MAX_SEED or count < 0 or start < 0 or tasks_per_scene < 1:
         raise ScenarioError(
@@ -221,7 +223,7 @@ def training_episodes(
     group, skip = divmod(start, tasks_per_scene)
     left = count
     while left > 0:
-        made = scenario_group(seed, group, kinds, min(tasks_per_scene, skip + left), tasks_per_scene)
+        made = scenario_group(seed, group, kinds, min(tasks_per_scene, skip + left), tasks_per_scene, turned_share)
         yield from made[skip:]
         left -= len(made) - skip
         group, skip = group + 1, 0
@@ -240,15 +242,19 @@ def kind_of_group(seed: int, group: int, kinds: Mapping[str, float]) -> str:
 
 
 def scenario_group(
-    seed: int, group: int, kinds: Mapping[str, float], count: int, tasks_per_scene: int = TASKS_PER_SCENE
-) -> list[Scenario]:
+    seed: int, group: int, kinds: Mapping[str, float], count: int, tasks_per_scene: int = TASKS_PER_SCENE,
+    turned_share: float = 0.0,
+) -> list[Scenario]:  # fmt: skip
     """Return the first `count` scenarios of one group, usually of one layout. Raises ScenarioError."""
     kind = kind_of_group(seed, group, kinds)
     sites: dict[int, Site] = {}
-    return [_first_found(sites, kind, seed, group, group * tasks_per_scene + j) for j in range(count)]
+    numbers = range(group * tasks_per_scene, group * tasks_per_scene + count)
+    return [_first_found(sites, kind, seed, group, number, turned_share) for number in numbers]
 
 
-def _first_found(sites: dict[int, Site], kind: str, seed: int, group: int, number: int) -> Scenario:
+def _first_found(
+    sites: dict[int, Site], kind: str, seed: int, group: int, number: int, turned_share: float
+) -> Scenario:  # fmt: skip
     """Find a scenario in the group's layout, or in the next one if it has none."""
     why = ""
     for attempt in range(LAYOUT_TRIES):
@@ -256,14 +262,15 @@ def _first_found(sites: dict[int, Site], kind: str, seed: int, group: int, numbe
         try:
             if attempt not in sites:
                 sites[attempt] = Site(kind, layout_seed)
-            return _scenario(sites[attempt], seed, number)
+            return _scenario(sites[attempt], seed, number, turned_share)
         except (LayoutError, RouteError) as error:
             why = str(error)
     raise ScenarioError(f"scenario {number} of seed {seed} ({kind}): none in {LAYOUT_TRIES} layouts; the last: {why}")
 
 
-def _scenario(site: Site, seed: int, number: int) -> Scenario:
+def _scenario(site: Site, seed: int, number: int, turned_share: float) -> Scenario:
     rng = np.random.default_rng((seed, number, site.layout_seed, _TAG))
+    turned, heading = np.random.default_rng((seed, number, site.layout_seed, _TAG, 1)).uniform(size=2)
     outdoors = site.outdoors
     robot = ROBOTS[int(rng.integers(len(ROBOTS)))]
     people = int(_at(float(rng.uniform()), _CROWDS.get(site.kind, _CROWDS["outdoors" if outdoors else "indoors"])))
@@ -277,6 +284,8 @@ def _scenario(site: Site, seed: int, number: int) -> Scenario:
         if not _wanted(site, task, rng):
             why = "it was not wanted"
             continue
+        if turned < turned_share:
+            task = replace(task, start=(*task.start[:2], round(float(2 * heading - 1) * pi, 3)))
         try:
             return scenario_of(site, task, int(rng.integers(2**31)), robot, people, seed, number)
         except RouteError as error:
@@ -286,11 +295,12 @@ def _scenario(site: Site, seed: int, number: int) -> Scenario:
 
 def scenario_of(site: Site, task: Task, wording_seed: int, robot: str, people: int, seed: int, number: int) -> Scenario:
     """Add true wordings, robot and crowd to a task. Raises RouteError if there is no wording or no path."""
+    first = facing(task.start, task.path)
     try:
-        texts = wordings(task.route, WORDINGS, wording_seed, held_out=False)
+        texts = wordings(task.route, WORDINGS, wording_seed, held_out=False, first=first)
     except WordingError as error:
         raise RouteError(str(error)) from error
-    if any(untrue(text, task.route) for text in texts):
+    if any(untrue(text, task.route, first) for text in texts):
         raise RouteError("a wording is not true of it")
     if named_too_small(site.scene, site.lines, task.path, named_landmarks(texts, task.route)):
         raise RouteError("something that is named is nowhere seen well")

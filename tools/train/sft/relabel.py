@@ -110,6 +110,7 @@ class InstructionRelabels:
     def __init__(self, dataset: Dataset, config: RelabelConfig, seed: int, speed_mps: float) -> None:
         """Open the existing relabels; `build` computes missing ones. `speed_mps`: the expert's speed."""
         per_drive = {"ways": config.ways, "tries": config.tries, "off_m": config.off_m}
+        per_drive |= {"turned": True} if config.turned else {}
         numbers = {"format": FORMAT, "seed": seed, "speed_mps": speed_mps, **per_drive}
         self.key = hashlib.sha256(json.dumps(numbers, sort_keys=True).encode()).hexdigest()
         self.folder = dataset.folder / FOLDER / self.key[:16]
@@ -190,7 +191,7 @@ def relabel(drive: Drive, site: Site, config: RelabelConfig, seed: int, speed_mp
     for thing in things:
         if len(found) >= config.ways:
             break
-        scenario = _to(site, start, thing, drive, int(rng.integers(2**31)))
+        scenario = _to(site, start, thing, drive, int(rng.integers(2**31)), turned=config.turned)
         if scenario is not None and (one := relabel_along(drive, scenario, speed_mps, config.off_m, lines)):
             found.append(one)
     return found
@@ -202,15 +203,20 @@ def _was_here(drive: Drive, site: Site) -> bool:
     return drive.about.scene == site.scene.name and float(np.mean(free)) >= _FREE
 
 
-def _to(site: Site, start: Vec3, thing: SceneObject, drive: Drive, wording_seed: int) -> Scenario | None:
-    """Make the task to go from a drive's start to an object; None if it has no instruction, or is the drive's own."""
+def _to(
+    site: Site, start: Vec3, thing: SceneObject, drive: Drive, wording_seed: int, *, turned: bool
+) -> Scenario | None:
+    """Make the task to go from a drive's start to an object; None if it has no instruction, or is the drive's own.
+
+    `turned`: also if its route does not begin ahead of the robot.
+    """
     about = drive.about
     try:
         task = make_task(site.scene, site.grid, start, thing)
         gaps = [hypot(task.goal[0] - x, task.goal[1] - y) for x, y in (about.goal_xy, start[:2])]
         if gaps[0] < _APART_M or gaps[1] < site.threshold_m + _APART_M:
             return None
-        if not (begins_ahead(task) and is_sound(site, task)):
+        if not is_sound(site, task) or not (turned or begins_ahead(task)):
             return None
         return scenario_of(site, task, wording_seed, about.robot, about.people, 0, 0)
     except (RouteError, ScenarioError):

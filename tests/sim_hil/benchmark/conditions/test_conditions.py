@@ -47,7 +47,7 @@ def test_a_switch_without_an_option_is_the_manifests() -> None:
 
 def test_conditions_of_an_older_version_can_still_be_read() -> None:
     content = asked("--policy", "artifacts:nano").as_json()
-    added = ("decoding", "recovery", "speculation", "wordings", "swap_instructions")
+    added = ("decoding", "recovery", "speculation", "wordings", "swap_instructions", "turn_starts")
     old = {key: value for key, value in content.items() if key not in added}
     assert Conditions.of_json(old) == asked("--policy", "artifacts:nano")
 

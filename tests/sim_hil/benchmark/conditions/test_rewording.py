@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import pytest
@@ -53,6 +54,28 @@ def test_training_wordings_are_of_no_benchmark_pattern_and_as_many() -> None:
         assert len(after.instructions) == len(before.instructions) >= 4
         assert not any(is_held_out(text) for text in after.instructions)
         assert all(is_held_out(text) for text in before.instructions)
+
+
+@pytest.mark.slow
+def test_a_turned_start_is_the_same_for_all_episodes_of_a_task_and_the_instruction_says_how_to_turn() -> None:
+    part = [each for each in EPISODES if each.scene == "hospital"]
+    found = reworded(part, Conditions(PolicySpec("still"), turn_starts=1), lambda: EPISODES)
+    headings: dict[str, float] = {}
+    for before, after in zip(part, found, strict=True):
+        assert replace(after, start=before.start, instructions=before.instructions) == before
+        assert after.start[:2] == before.start[:2]
+        assert headings.setdefault(after.task, after.start[2]) == after.start[2] != before.start[2]
+        assert all(is_held_out(text) for text in after.instructions)
+        assert len(after.instructions) == len(before.instructions)
+    kept = [after.instructions == before.instructions for before, after in zip(part, found, strict=True)]
+    assert any(kept) and not all(kept), "only a route that no longer begins ahead is told anew"
+    assert any(re.search("turn a?round", text, re.IGNORECASE) for each in found for text in each.instructions)
+    assert found == reworded(part, Conditions(PolicySpec("still"), turn_starts=1), lambda: EPISODES)
+
+
+def test_a_start_is_not_turned_with_the_instruction_of_another_task() -> None:
+    with pytest.raises(ConditionsError, match="without swapped instructions"):
+        replace(SWAPPED, turn_starts=1)
 
 
 @pytest.mark.slow

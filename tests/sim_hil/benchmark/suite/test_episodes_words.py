@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import pi
+from math import cos, pi, radians, sin
 
 import numpy as np
 import pytest
 
 from sim_hil import layouts
 from sim_hil.benchmark.language.instruction_reading import Claim, read, untrue
+from sim_hil.benchmark.language.instruction_words import AROUND
 from sim_hil.benchmark.language.instructions import WordingError, is_held_out, pattern, wordings
 from sim_hil.benchmark.language.route import RouteDescription, RouteError
-from sim_hil.benchmark.language.tasks import Task, make_task, sample_task
+from sim_hil.benchmark.language.tasks import Task, facing, make_task, sample_task
 from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.scene.scene import Area, Scene, SceneObject, Wall
 
@@ -184,6 +185,34 @@ def test_a_description_is_read_as_ordered_claims() -> None:
     assert claims == [
         Claim("pass", "left", name="red bench"), Claim("turn", "right", 3, "passage"), Claim("goal", name="drum"),
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize("first", [AROUND, "left", "right"])
+def test_a_robot_that_does_not_face_its_route_is_told_how_to_turn(first: str, way: RouteDescription) -> None:
+    for text in wordings(way, 20, 3, held_out=False, first=first):
+        assert [claim.side for claim in read(text) if claim.kind == "face"] == [first]
+        assert untrue(text, way, first) == []
+        assert untrue(text, way) == [f"turn on the spot: expected none, found {first}"]
+        assert any(f"must turn {first}" in line for line in untrue(wordings(way, 1, 3, held_out=False)[0], way, first))
+
+
+def test_a_robot_in_a_room_may_be_told_to_leave_it_and_no_more(way: RouteDescription) -> None:
+    inside = replace(way, leaves_room=True, steps=(replace(way.steps[0], before_kind="room"),))
+    claims = [read(text) for text in wordings(inside, 40, 3, held_out=False, first=AROUND)]
+    told = sum(any(claim.kind == "face" for claim in each) for each in claims)
+    assert 8 < told < 32
+    assert untrue(wordings(inside, 1, 3, held_out=False)[0], inside, AROUND) == []
+
+
+@pytest.mark.parametrize(
+    ("degrees_left", "first"),
+    [(0, ""), (50, ""), (-50, ""), (70, "left"), (-110, "right"), (130, AROUND), (180, AROUND)],
+)
+def test_how_a_robot_turns_depends_on_where_its_path_begins(degrees_left: float, first: str) -> None:
+    for heading_rad in (0.0, 3.0, -2.0):
+        bearing_rad = heading_rad + radians(degrees_left)
+        path = [(1.0, 2.0), (1.0 + 5 * cos(bearing_rad), 2.0 + 5 * sin(bearing_rad))]
+        assert facing((1.0, 2.0, heading_rad), path) == first
 
 
 @pytest.mark.slow

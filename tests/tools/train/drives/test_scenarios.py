@@ -10,6 +10,7 @@ import pytest
 
 from sim_hil.benchmark.language.instruction_reading import untrue
 from sim_hil.benchmark.language.instructions import is_held_out, pattern
+from sim_hil.benchmark.language.tasks import facing
 from sim_hil.benchmark.suite.episode import load_suite
 from sim_hil.layouts import LayoutError
 from sim_hil.scene.scene import Scene, load_scene
@@ -128,6 +129,18 @@ def test_the_same_seed_gives_the_same_scenarios_whichever_of_them_are_drawn() ->
     alone = [s.episode for s in training_episodes(SEED, 1, kinds, start=2, tasks_per_scene=2)]
     assert together[2:] == alone
     assert [s.episode for s in training_episodes(SEED, 1, kinds, start=1, tasks_per_scene=2)] == together[1:2]
+
+
+def test_a_turned_start_changes_heading_and_words_alone() -> None:
+    kinds = {CORRIDOR: 1.0}
+    usual, turned = (list(training_episodes(SEED, 4, kinds, tasks_per_scene=2, turned_share=x)) for x in (0.0, 1.0))
+    for each, other in zip(usual, turned, strict=True):
+        words = {"instructions": other.wordings, "landmarks": other.episode.landmarks}
+        assert replace(each.episode, start=other.episode.start, **words) == other.episode
+        assert each.task.path == other.task.path and each.episode.start[:2] == other.episode.start[:2]
+        first = facing(other.episode.start, other.task.path)
+        assert not any(untrue(text, other.route, first) for text in other.wordings)
+    assert any(facing(each.episode.start, each.task.path) for each in turned)
 
 
 def test_kinds_come_in_their_shares_even_in_a_short_run() -> None:
