@@ -7,7 +7,7 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -63,10 +63,13 @@ class Children:
             for child in reversed(self._started):
                 self.end(child)
 
-    def start(self, step: str, command: Sequence[str], *, fifo_priority: int = 0) -> Child:
+    def start(
+        self, step: str, command: Sequence[str], *, fifo_priority: int = 0, processors: Collection[int] = ()
+    ) -> Child:
         """Start a step. Raises StepError if its program cannot be started.
 
-        `fifo_priority` above 0: real-time priority, if the user is permitted to use it.
+        `fifo_priority` above 0: real-time priority, if the user is permitted to use it. `processors`: on which it may
+        run; empty: on any.
         """
         log = self.log_dir / f"{step}.log"
         with log.open("wb") as stream:
@@ -78,7 +81,8 @@ class Children:
                     stderr=subprocess.STDOUT,
                     # A session of its own: Ctrl-C reaches the parent alone, which then stops its children in order.
                     start_new_session=True,
-                    preexec_fn=partial(_prepare, fifo_priority),  # system calls alone; nothing in it can meet a lock
+                    # System calls alone: nothing in it can meet a lock.
+                    preexec_fn=partial(_prepare, fifo_priority, processors),
                 )
             except OSError as error:
                 raise StepError(f"step '{step}' failed: {command[0]} cannot be started: {error}") from error
@@ -161,9 +165,11 @@ def _kill_session(pid: int) -> None:
         os.killpg(pid, signal.SIGKILL)  # start_new_session made the child the leader of a group of its own
 
 
-def _prepare(fifo_priority: int) -> None:
+def _prepare(fifo_priority: int, processors: Collection[int]) -> None:
     # Even a SIGKILL of the parent must not leave a robot walking: the kernel then interrupts the children.
     signal_on_parent_death(signal.SIGINT)
     if fifo_priority > 0:
         with suppress(PermissionError):
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(fifo_priority))
+    if processors:
+        os.sched_setaffinity(0, processors)

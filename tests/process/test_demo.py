@@ -231,6 +231,15 @@ def test_a_child_deaf_to_sigint_is_killed_with_all_it_started(tmp_path: Path) ->
     assert time.monotonic_ns() < end_ns
 
 
+def test_a_process_stays_on_the_processors_that_it_is_given(tmp_path: Path) -> None:
+    processor = max(os.sched_getaffinity(0))
+    with Children(tmp_path) as running:
+        script = "import os; print(os.sched_getaffinity(0))"
+        child = running.start("bridge", [sys.executable, "-c", script], processors=(processor,))
+        running.wait(child, 10, lambda: None)
+    assert last_lines(child.log) == [str({processor})]
+
+
 def test_processes_end_in_reverse_order_of_their_start(tmp_path: Path) -> None:
     script = (
         "import signal, sys, time\n"

@@ -112,7 +112,7 @@ def test_the_first_contact_is_remembered() -> None:
 def test_the_true_path_is_sampled_as_in_lockstep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
 
-    def start(_children: Children, step: str, command: Sequence[str], *, fifo_priority: int = 0) -> Child:
+    def start(_children: Children, step: str, command: Sequence[str], **_: object) -> Child:
         asked.extend(command)
         raise StepError(step)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -36,14 +36,16 @@ class ProbedChildren(Children):
 
     trace_frames = 0
 
-    def start(self, step: str, command: Sequence[str], *, fifo_priority: int = 0) -> Child:
+    def start(
+        self, step: str, command: Sequence[str], *, fifo_priority: int = 0, processors: Collection[int] = ()
+    ) -> Child:
         """Start a step; raises StepError."""
         if command[1] == "-m" and step.startswith(JUDGED):
             frames = self.trace_frames if step.startswith("edge-run") else 0
             file = str(self.log_dir / f"memory-{step}.jsonl")
             probe = ["-m", "tools.memory.probe", file, str(PERIOD_S), str(frames)]
             command = [command[0], *probe, *command[2:]]
-        return super().start(step, command, fifo_priority=fifo_priority)
+        return super().start(step, command, fifo_priority=fifo_priority, processors=processors)
 
 
 @dataclass(frozen=True)
