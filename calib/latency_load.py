@@ -171,7 +171,7 @@ def measure(
     reasoning = ReasoningLoop(
         GenerationModels(language, policy),
         SharedState(ring, slot),
-        ReasoningConfig(runtime.frame_offsets_s, runtime.max_new_tokens, mode),
+        ReasoningConfig(runtime.frame_offsets_s, runtime.max_new_tokens, mode, turns_as_told=False),
         instruction,
         stop=stop,
         schedule=ReasoningSchedule(give_way=GiveWay(activity) if schedule.shared else None, role=schedule.reasoning),

@@ -21,6 +21,8 @@ TURN_IN_PLACE_M = 0.05
 STEER_M = 0.25
 """Distance from which only its direction is followed, m: that of a robot that hardly moves is noise."""
 MAX_STEP_S = 0.2
+NO_SEMANTIC_STATE = "no-semantic-state"
+"""Reason for standing before the first text of an instruction."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +137,7 @@ class Controller:
         self._last_ns = now_ns
         reason = self._refusal(inputs)
         if reason is not None or inputs.trajectory is None:
-            return self.halt(reason or "no-semantic-state")
+            return self.halt(reason or NO_SEMANTIC_STATE)
         target = target_of(inputs.trajectory, self._config.step_s)
         speed, yaw_rate = arc_to(target, TARGET_TIME_S)
         limits = self._config.limits
@@ -158,7 +160,7 @@ class Controller:
         if inputs.odometry_age_ms is None or not 0 <= inputs.odometry_age_ms <= config.odometry_max_age_ms:
             return "stale-odometry"
         if inputs.trajectory is None:
-            return "no-semantic-state"
+            return NO_SEMANTIC_STATE
         if not is_plan(inputs.trajectory):
             return "bad-output"
         return None

@@ -24,6 +24,7 @@ import numpy.typing as npt
 
 from edge.core.geometry import SE2, wrap_angle
 from edge.motion.controller import TARGET_TIME_S, VelocityCommand, arc_to
+from edge.motion.turn_on_the_spot import TOLD
 from edge.state.switches import RecoverySwitch, Switches
 from firmware_bridge.core.config import LimitsConfig
 
@@ -32,8 +33,8 @@ BACKING_OFF: Final = "backing-off"
 TURNING: Final = "turning-to-waypoints"
 ARRIVED: Final = "arrived"
 """Reason of a command: the plan's own, or a recovery's."""
-MOVING: Final = frozenset((BACKING_OFF, TURNING))
-"""Reasons of the recoveries that move the robot."""
+MOVING: Final = frozenset((BACKING_OFF, TURNING, TOLD))
+"""Reasons of what moves the robot in the plan's place."""
 HELD: Final = frozenset(("odometry-frozen", "robot-blocked"))
 """Reasons of a stop after which the robot backs off: its pose stayed although it was commanded to move."""
 

@@ -75,6 +75,8 @@ class ReasoningConfig:
     """Longest text that the artifacts allow, tokens."""
     mode: Mode = Mode.ASYNC
     decoding: Decoding = Decoding.CONSTRAINED
+    turns_as_told: bool = True
+    """Whether control makes the turn on the spot that an instruction begins with; otherwise the model reads it."""
 
     def __post_init__(self) -> None:
         if not all(math.isfinite(offset_s) and offset_s >= 0 for offset_s in self.frame_offsets_s):

@@ -14,9 +14,12 @@ from typing import Final
 
 from edge.core.geometry import SE2, wrap_angle
 from edge.reasoning.decoding_rules import DONE, DecodingContext, TextConstraint, TurnEstimator
+from edge.reasoning.generation_cycle import ReasoningConfig
 from edge.reasoning.path_memory import PERIOD_NS, PastPath, PathMemory
+from edge.reasoning.told_turn import split_turn
 from edge.state.reasoning_text import ReasoningText, Stop, parse_text
 from edge.state.ring import EncodedFrame, TokenRing
+from edge.state.semantic import SemanticSlot
 from edge.state.switches import Decoding
 
 MOST_FRAMES = 1 << 16
@@ -90,12 +93,16 @@ class InstructionMemory:
 
     def __init__(self, from_ns: int | None, instruction: str, decoding: Decoding = Decoding.CONSTRAINED) -> None:
         """`from_ns`: the newest frame's stamp when the instruction was given; None: the path begins at any frame."""
+        self._instruction, self._decoding = instruction, decoding
+        self.begin(from_ns)
+
+    def begin(self, from_ns: int | None) -> None:
+        """Forget everything before the frame with this stamp; None: the path begins at any frame."""
         self.from_ns = from_ns
-        self._decoding = decoding
         self._path = PathMemory()
         self._context = DecodingContext()
         self._turn = TurnEstimator()
-        self._stop = StopEstimator(instruction)
+        self._stop = StopEstimator(self._instruction)
 
     @property
     def stop(self) -> SE2 | None:
@@ -154,6 +161,52 @@ class Job:
     number: int
     instruction: str
     memory: InstructionMemory
+
+
+class Instructions:
+    """Makes jobs of instructions, and lets control make the turn on the spot that one begins with."""
+
+    def __init__(self, config: ReasoningConfig, slot: SemanticSlot, instruction: str) -> None:
+        """`instruction`: the first one."""
+        self._config, self._slot = config, slot
+        self._waits: InstructionMemory | None = None  # it begins when the turn has ended
+        self.job = self._job(0, instruction, None)
+        """The newest job."""
+
+    def next(self, instruction: str, newest_ns: int | None) -> Job:
+        """Return the job of another instruction, given when the newest frame had this stamp.
+
+        After a turn alone the job before goes on.
+        """
+        self.job = self._job(self.job.number + 1, instruction, newest_ns)
+        return self.job
+
+    def again(self) -> Job:
+        """Return the newest job once more, as another one."""
+        self.job = replace(self.job, number=self.job.number + 1)
+        return self.job
+
+    def ready(self, job: Job, newest_ns: int | None) -> bool:
+        """Whether the job's turn has ended; its memory then begins at the newest frame."""
+        if self._slot.turn is not None:
+            return False
+        if self._waits is job.memory:
+            self._waits = None
+            job.memory.begin(newest_ns)
+        return True
+
+    def _job(self, number: int, instruction: str, newest_ns: int | None) -> Job:
+        turn, rest = split_turn(instruction) if self._config.turns_as_told else (None, instruction)
+        if turn is not None and not rest:
+            if number == 0:
+                turn, rest = None, instruction  # there is nothing to go on with
+            else:
+                self._slot.tell(turn)
+                return replace(self.job, number=number)
+        memory = InstructionMemory(newest_ns, rest, self._config.decoding)
+        self._waits = None if turn is None else memory
+        self._slot.tell(turn)
+        return Job(number, rest, memory)
 
 
 def _words(text: str) -> tuple[str, ...]:

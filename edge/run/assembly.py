@@ -141,7 +141,9 @@ def assemble(
     reasoning = ReasoningLoop(
         GenerationModels(engines.language, engines.policy),
         shared,
-        ReasoningConfig(runtime.frame_offsets_s, runtime.max_new_tokens, options.mode, switches.decoding),
+        ReasoningConfig(
+            runtime.frame_offsets_s, runtime.max_new_tokens, options.mode, switches.decoding, switches.turns_as_told
+        ),
         options.instruction,
         stop=stop.reasoning,
         schedule=ReasoningSchedule(

@@ -12,13 +12,13 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from edge.core.geometry import SE2
 from edge.core.stats import Samples
 from edge.flightlog.recorder import RecordSink
 from edge.inference.graph import GraphError
 from edge.inference.policy import Policy
 from edge.motion.controller import TARGET_TIME_S, Controller, ControllerInputs, VelocityCommand, is_plan
 from edge.motion.recovery import MOVING, Recovery
+from edge.motion.turn_on_the_spot import TurnConfig, TurnOnTheSpot
 from edge.safety.faults.findings import Finding
 from edge.safety.faults.table import FAULT_OF_CAUSE
 from edge.safety.late_command import LATE_NS
@@ -28,7 +28,7 @@ from edge.safety.supervisor import FaultEvent, State, Supervisor, SupervisorInpu
 from edge.state.frame import Frame
 from edge.state.pose_history import PoseHistory, StampedPose
 from edge.state.ring import EncodedFrame
-from edge.state.semantic import LatencyInput, SemanticState, SharedState, waypoints_now
+from edge.state.semantic import LatencyInput, SemanticState, SharedState, leading_waypoints
 from edge.state.switches import Switches
 from firmware_bridge.client import BridgeStatus
 
@@ -149,6 +149,7 @@ class ControlLoop:
         self._ring, self._slot = shared.ring, shared.slot
         self._controller, self._watch, self._supervisor = chain.controller, chain.watch, chain.supervisor
         self._recovery = Recovery(config.switches, chain.controller.config.limits)
+        self._turning = TurnOnTheSpot(TurnConfig(chain.controller.config.limits.wz_max_radps))
         self._sink, self._recorder, self._on_tick = outputs.sink, outputs.recorder, outputs.on_tick
         self.last_seq = 0
         """Sequence number of the last command; arming uses some before the first tick."""
@@ -238,13 +239,14 @@ class ControlLoop:
             hold=self._hold(semantic, pose, acted_ns),
         )
         T_odom_base = None if pose is None else pose.T_odom_base
-        command = self._recovery.step(
-            self._controller.step(inputs, acted_ns),
-            None if latency is None else _leading_waypoints(semantic, latency.offset),
-            T_odom_base,
-            acted_ns,
-            inputs.speed_scale,
-        )
+        waypoints = None if latency is None else leading_waypoints(semantic, latency.offset)
+        command, turn = self._controller.step(inputs, acted_ns), self._slot.turn
+        if turn is not None:
+            told = self._turning.step(turn, command, T_odom_base, acted_ns, inputs.speed_scale)
+            if told is None:
+                self._slot.end(turn)
+            command = told or command
+        command = self._recovery.step(command, waypoints, T_odom_base, acted_ns, inputs.speed_scale)
         if command.reason in MOVING:
             self._controller.halt(command.reason)  # the next command accelerates from standstill
         if self._sent_ns is not None and self._clock() - self._sent_ns >= LATE_NS:
@@ -390,11 +392,3 @@ class ControlLoop:
             return None
         every = max(1, round(TARGET_TIME_S / self._config.step_s))
         return [[float(v) for v in row] for row in trajectory[every - 1 :: every]]
-
-
-def _leading_waypoints(semantic: SemanticState | None, offset: SE2) -> npt.NDArray[np.float32] | None:
-    """Return the last text's waypoints [points, 2], m in the current robot frame; None where it plans to wait."""
-    if semantic is None or semantic.waypoints is None or semantic.waits:
-        return None
-    points: npt.NDArray[np.float32] = waypoints_now(semantic.waypoints, offset)[0]
-    return points

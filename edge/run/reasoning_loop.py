@@ -34,7 +34,7 @@ from edge.reasoning.generation_cycle import (
     ReasoningBudget,
     ReasoningConfig,
 )
-from edge.reasoning.instruction_state import InstructionMemory, Job
+from edge.reasoning.instruction_state import Instructions, Job
 from edge.state.ring import EncodedFrame
 from edge.state.semantic import SemanticState, SharedState
 
@@ -149,8 +149,8 @@ class ReasoningLoop:
         self._outputs = outputs or ReasoningOutputs()
         self._stop = stop
         self._clock = clock
-        self._decoding = config.decoding
-        self._job = Job(0, instruction, InstructionMemory(None, instruction, config.decoding))
+        self._instructions = Instructions(config, shared.slot, instruction)
+        self._job = self._instructions.job
         self._under_way: tuple[Job, Interrupt] | None = None
         self._prefixes_ns: deque[int] = deque(maxlen=PREFIXES)
         self._context_ns = 0
@@ -177,12 +177,11 @@ class ReasoningLoop:
 
     def submit(self, instruction: str) -> None:
         """Follow this (checked) instruction from now on and end the generation under way. Never waits."""
-        memory = InstructionMemory(self._ring.newest_ns, instruction, self._decoding)
-        self._replace(Job(self._job.number + 1, instruction, memory))
+        self._replace(self._instructions.next(instruction, self._ring.newest_ns))
 
     def cancel(self) -> None:
         """End the generation under way, also within a call; the next one begins with the newest frames."""
-        self._replace(Job(self._job.number + 1, self._job.instruction, self._job.memory))
+        self._replace(self._instructions.again())
 
     def _replace(self, job: Job) -> None:
         self._job = job
@@ -200,8 +199,10 @@ class ReasoningLoop:
 
     def step(self) -> bool:
         """Run one generation if one may start; returns whether a semantic state was published."""
-        self._job.memory.watch(self._ring)
         job, interrupt = self._job, Interrupt()
+        if not self._instructions.ready(job, self._ring.newest_ns):
+            return False
+        job.memory.watch(self._ring)
         outputs = self._advance(starting=job)
         if outputs.action is not Action.START:
             return False

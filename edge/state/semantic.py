@@ -101,13 +101,42 @@ def waypoints_now(waypoints: Waypoints, offset: SE2) -> npt.NDArray[np.float32]:
     return np.array([points], dtype=np.float32)
 
 
+def leading_waypoints(semantic: SemanticState | None, offset: SE2) -> npt.NDArray[np.float32] | None:
+    """Return the last text's waypoints [points, 2], m in the current robot frame; None where it plans to wait."""
+    if semantic is None or semantic.waypoints is None or semantic.waits:
+        return None
+    points: npt.NDArray[np.float32] = waypoints_now(semantic.waypoints, offset)[0]
+    return points
+
+
+@dataclass(frozen=True, eq=False)
+class ToldTurn:
+    """A turn on the spot that an instruction begins with; no two are the same, also with equal angles."""
+
+    turn_rad: float
+    """Positive to the left."""
+
+
 class SemanticSlot:
     """The slot of the reasoning thread's newest result; reading and replacing a field are single operations."""
 
     def __init__(self) -> None:
+        self.turn: ToldTurn | None = None
+        """The turn that control makes before reasoning goes on; None: there is none, or it has ended."""
         self.state: SemanticState | None = None
         self.drive_until_ns: int | None = None
         """End of the time in which the robot may drive, ns; None: no such end."""
+
+    def tell(self, turn: ToldTurn | None) -> None:
+        """Replace the turn; before one, the robot forgets what it was about to do."""
+        self.turn = turn
+        if turn is not None:
+            self.state = None
+
+    def end(self, turn: ToldTurn) -> None:
+        """End a turn, unless another one has replaced it; nothing from before it drives the robot."""
+        if self.turn is turn:
+            self.state = self.turn = None
 
 
 @dataclass(frozen=True)

@@ -48,6 +48,11 @@ class Switches:
         if self.stand_at_goal and self.recovery is RecoverySwitch.OFF:
             raise ValueError("standing at the goal (--stay) is a recovery: expected --recovery on with it, found off")
 
+    @property
+    def turns_as_told(self) -> bool:
+        """Whether the robot makes the turn on the spot that an instruction begins with, instead of the model."""
+        return self.recovery is RecoverySwitch.ON
+
     def as_json(self) -> dict[str, Any]:
         """Return the fields as results and flight logs hold them."""
         return {

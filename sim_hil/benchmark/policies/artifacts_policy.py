@@ -181,7 +181,9 @@ class _Drive:
         self._reasoner = VirtualTimeReasoner(
             GenerationModels(language, model),
             shared,
-            ReasoningConfig(runtime.frame_offsets_s, runtime.max_new_tokens, mode, switches.decoding),
+            ReasoningConfig(
+                runtime.frame_offsets_s, runtime.max_new_tokens, mode, switches.decoding, switches.turns_as_told
+            ),
             instruction,
             draw,
             recorder,

@@ -25,7 +25,7 @@ from edge.reasoning.generation_cycle import (
     GenerationCycle,
     ReasoningConfig,
 )
-from edge.reasoning.instruction_state import InstructionMemory, Job
+from edge.reasoning.instruction_state import Instructions
 from edge.state.semantic import SharedState
 from sim_hil.benchmark.conditions.latency import Timing
 
@@ -67,7 +67,8 @@ class VirtualTimeReasoner:
         self._models = models
         self._ring, self._slot = shared.ring, shared.slot
         self._offsets_s = config.older_offsets_s
-        self._job = Job(0, instruction, InstructionMemory(None, instruction, config.decoding))
+        self._instructions = Instructions(config, shared.slot, instruction)
+        self._job = self._instructions.job
         self._draw = draw
         self._under_way: _UnderWay | None = None
         self.cycle = GenerationCycle(config)
@@ -96,6 +97,8 @@ class VirtualTimeReasoner:
 
     def start(self, now_ns: int) -> None:
         """Start a generation, or capture a late newest frame; call this after each tick, whose frame is in the ring."""
+        if not self._instructions.ready(self._job, self._ring.newest_ns):
+            return
         if self._under_way is None:
             outputs = self._advance(now_ns)
             if outputs.action is Action.START:
@@ -117,7 +120,7 @@ class VirtualTimeReasoner:
         anchor = None if newest_ns is None else self._ring.nearest(newest_ns)
         if anchor is None:
             return
-        task.older += older_frames(self._ring, Anchor.now(anchor.stamp_ns), self._offsets_s)
+        task.older += older_frames(self._ring, Anchor.now(anchor.stamp_ns), self._offsets_s, task.job.memory.from_ns)
         task.set_anchor(anchor, self._ring)
         self._advance(now_ns, Anchored(anchor.stamp_ns))
 

@@ -10,10 +10,12 @@ import pytest
 
 from edge.core.geometry import SE2
 from edge.motion.recovery import BACKING_OFF, TURNING
+from edge.motion.turn_on_the_spot import TOLD
 from edge.run.control_loop import ControlConfig
 from edge.safety.faults.findings import Finding
 from edge.safety.faults.table import FAULT_OF_CAUSE
 from edge.state.pose_history import StampedPose
+from edge.state.semantic import ToldTurn
 from tests.support.runner.control_bench import LIMITS, PERIOD_NS, Bench
 
 
@@ -216,6 +218,37 @@ def test_a_robot_whose_plan_stands_turns_to_where_its_text_leads_and_speeds_up_f
     bench.policy.step = (0.05, 0.0, 0.0)
     bench.see(x_m=1.0)
     assert bench.tick() == (pytest.approx(0.1), "ok")
+
+
+def test_a_robot_makes_the_turn_that_it_is_told_before_anything_drives_it(bench: Bench) -> None:
+    turn, heading_rad = ToldTurn(math.pi), 0.0
+    bench.see()
+    bench.think(0)
+    bench.tick()
+    bench.slot.tell(turn)
+    for _ in range(100):
+        bench.history.put(StampedPose(bench.now_ns, SE2(0.04, 0.0, heading_rad), 0.0, 0.0, 0.0))
+        bench.look()
+        vx_mps, reason = bench.tick()
+        if reason != TOLD:
+            break
+        assert vx_mps == 0.0
+        heading_rad += bench.sink.commands[-1][2] * PERIOD_NS / 1e9
+    assert (reason, bench.slot.turn, bench.slot.state) == ("no-semantic-state", None, None)
+    assert heading_rad == pytest.approx(math.pi, abs=0.1)
+    bench.think(1)
+    bench.see()
+    assert bench.tick()[1] == "ok"
+    assert 0.0 < bench.sink.commands[-1][1] <= LIMITS.accel_mps2 * PERIOD_NS / 1e9, "from a standstill"
+
+
+def test_another_instruction_ends_a_turn_that_is_under_way(bench: Bench) -> None:
+    bench.slot.tell(ToldTurn(math.pi))
+    bench.see()
+    assert bench.tick()[1] == TOLD
+    bench.slot.tell(None)
+    bench.see()
+    assert bench.tick() == (0.0, "no-semantic-state")
 
 
 def test_a_text_that_waits_for_a_person_leaves_the_robot_standing() -> None:

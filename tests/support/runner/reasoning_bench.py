@@ -146,6 +146,7 @@ class Bench:
         give_way: object = None,
         stop: threading.Event | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
+        instruction: str = "go",
     ) -> None:
         self.language = FakeLanguage()
         self.policy = FakePolicy()
@@ -160,7 +161,7 @@ class Bench:
             GenerationModels(self.language, self.policy),  # type: ignore[arg-type]
             SharedState(self.ring, self.slot),
             ReasoningConfig((0.0, 3.0), 4, mode, decoding),
-            "go",
+            instruction,
             stop=self.stop,
             schedule=ReasoningSchedule(
                 release_delay_s=lambda: delay_s,

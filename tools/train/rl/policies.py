@@ -262,7 +262,7 @@ class TailPolicy:
         self._reasoner = VirtualTimeReasoner(
             GenerationModels(models.language, stand_in),
             SharedState(self._ring, self.slot),
-            ReasoningConfig(runtime.frame_offsets_s, runtime.max_new_tokens),
+            ReasoningConfig(runtime.frame_offsets_s, runtime.max_new_tokens, turns_as_told=False),
             instruction,
             draw,
         )

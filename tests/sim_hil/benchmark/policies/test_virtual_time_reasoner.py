@@ -31,6 +31,7 @@ class Bench:
         anchor_after_s: float = 0.0,
         coasting: tuple[float, ...] = (),
         call_s: float | None = None,
+        instruction: str = "go",
     ) -> None:
         self.x_m, self.coasting, self.left = 0.0, coasting, ()
         self.language, self.policy = FakeLanguage(), FakePolicy()
@@ -41,7 +42,7 @@ class Bench:
             GenerationModels(self.language, self.policy),  # type: ignore[arg-type]
             SharedState(self.ring, self.slot),
             ReasoningConfig((0.0, 3.0), 4, mode),
-            "go",
+            instruction,
             lambda: timing,
         )
         self.seen: list[tuple[float, int | None, float | None]] = []
@@ -125,3 +126,13 @@ def test_sync_does_not_wait_for_ever_for_odometry_to_rest() -> None:
     bench = Bench(2.0, mode=Mode.SYNC, coasting=(0.02,) * 100)
     bench.run(6.0)
     assert bench.reasoner.released[1]["anchor_s"] - 1 == pytest.approx(2.5 + 1.0)
+
+
+def test_reasoning_begins_when_control_has_made_the_turn_that_the_instruction_begins_with() -> None:
+    bench = Bench(1.0, instruction="Turn around. Go to the bench.")
+    bench.run(4.0)
+    assert bench.language.prompts == [] and bench.slot.turn is not None
+    bench.slot.end(bench.slot.turn)
+    bench.run(8.0)
+    assert set(bench.language.instructions) == {"Go to the bench."}
+    assert min(stamp for prompt in bench.language.prompts for stamp in prompt) > 5.0, "1 s is the beginning"
