@@ -13,6 +13,7 @@ from edge.core.geometry import SE2
 from edge.flightlog.reader import Damage, RecordingError, damage_notice, read_messages
 from edge.flightlog.replay.records import NO_TICK, RecordedGeneration, RecordedTick, read_events, read_run
 from edge.flightlog.standard_messages import Mount
+from edge.reasoning.told_turn import split_turn
 from edge.safety.faults.row import Action
 
 _ROUTE_NEAR_NS = 600_000_000
@@ -121,10 +122,12 @@ class Flight:
         """Instructions given during the run, each with the release of its first text, ns."""
         found: list[tuple[int, str]] = []
         now = self.instruction
+        first = (now, split_turn(now)[1])  # the model is not given a turn that control has made
         for each in sorted(self.generations.values(), key=lambda each: each.ready_ns):
             if each.instruction is not None and each.instruction != now:
                 now = each.instruction
-                found.append((each.ready_ns, now))
+                if found or now not in first:
+                    found.append((each.ready_ns, now))
         return found
 
     @property

@@ -278,6 +278,15 @@ def test_a_path_that_a_new_instruction_leads_back_is_no_detour() -> None:
     assert find_events(flight) == []
 
 
+def test_the_rest_of_an_instruction_after_the_turn_that_it_begins_with_is_no_new_one() -> None:
+    flight = flights.flight()
+    told = {n: replace(each, instruction="Leave the room.") for n, each in flight.generations.items()}
+    flight = replace(flight, instruction="Turn around, leave the room.", generations=told)
+    assert flight.new_instructions == []
+    later = {n: each if n < 5 else replace(each, instruction="come back") for n, each in told.items()}
+    assert replace(flight, generations=later).new_instructions == [(at(10.0), "come back")]
+
+
 def test_a_timeout_is_explained_by_the_event_that_took_longest() -> None:
     flight = flights.flight(
         ticks=lambda s: stopped(s, command=(0.0, 0.0, 0.0), reason="reasoning"), truths=standing_truth,
