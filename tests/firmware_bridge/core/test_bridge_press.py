@@ -11,7 +11,7 @@ from firmware_bridge.core.link import Release, Stop
 from firmware_bridge.core.rules import BridgeCore
 from firmware_bridge.core.step_types import Move, StopMotion
 from firmware_bridge.unitree.messages import ids
-from tests.support.robot.bridge_bench import BRIDGE, LIMITS, SAFETY, TABLE, ZERO, Bench
+from tests.support.robot.bridge_bench import BRIDGE, LIMITS, MS, SAFETY, TABLE, ZERO, Bench
 
 PRESSED = [ZERO, StopMotion(pressed=True)]
 
@@ -101,6 +101,16 @@ def test_repeats_of_one_command_are_one_press() -> None:
     assert requests(bench) == PRESSED * 2
 
 
+@pytest.mark.parametrize(("after_ns", "times"), [(1000 * MS, 1), (1000 * MS + 1, 2)])
+def test_a_press_is_another_one_more_than_a_second_after_the_last(after_ns: int, times: int) -> None:
+    bench = Bench()
+    _operator(bench)
+    bench.now_ns += after_ns
+    bench.step()
+    _operator(bench)
+    assert requests(bench) == PRESSED * times
+
+
 def test_a_press_at_the_robot_does_not_hide_one_at_this_computer() -> None:
     bench = Bench()
     _pilot(bench)
@@ -124,6 +134,16 @@ def test_a_base_that_holds_its_last_command_gets_zeros_for_a_second_when_the_bri
     assert {request for _, request in bench.written} == {ZERO} and len(times_ms) >= 50
     assert 980 <= max(times_ms) <= 1000
     assert bench.status.state == "disarmed"
+
+
+@pytest.mark.parametrize(("after_ns", "sent"), [(1000 * MS, [ZERO]), (1000 * MS + 1, [])])
+def test_the_second_ends_a_second_after_its_first_report(after_ns: int, sent: list[Move]) -> None:
+    bench = holding()
+    bench.step()
+    bench.written.clear()
+    bench.now_ns += after_ns
+    bench.step()
+    assert requests(bench) == sent
 
 
 def test_before_its_first_report_it_gets_none() -> None:

@@ -29,6 +29,7 @@ def _fall_silent(bench: Bench) -> None:
 def test_a_new_bridge_has_neither_a_cause_nor_a_count() -> None:
     status = Bench(client=False).status
     assert (status.cause, status.last_seq, status.commands, status.rejected) == ("none", 0, 0, 0)
+    assert status.robot == 0, "no robot file's"
 
 
 @pytest.mark.parametrize(
