@@ -175,7 +175,7 @@ class TextConstraint:
         self.planned = ""
         """The plan's line that was replaced; empty when none was."""
         self.has_plan = False
-        """Whether the text has reached the end of its plan."""
+        """Whether the text has reached the end of a plan that follows the grammar."""
 
     @property
     def overruled(self) -> bool:
@@ -204,6 +204,8 @@ class TextConstraint:
         if not line.startswith(PLAN_HEAD):
             return None
         plan, turn = parse_text(line).plan, self._context.turn
+        if self._form is not None and self._form.replaced:
+            return None  # not the model's plan
         self.turn, self.has_plan = observed_turn(plan), True
         if plan is None or turn is None or self._progress != self._context.before:
             return None

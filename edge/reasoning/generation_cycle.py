@@ -240,6 +240,10 @@ class GenerationCycle:
         self.invalid_in_a_row = 0
         """The same, counted since the last valid text."""
 
+    def pause(self) -> None:
+        """Wait for a turn on the spot: the texts from before it hold no robot that is to turn."""
+        self.invalid_in_a_row = 0
+
     def step(self, inputs: CycleInputs, now_ns: int) -> CycleOutputs:
         """Take the inputs and return the next action; pure apart from this object's own state."""
         if inputs.event is not None and self._phase is _Phase.RUNNING:

@@ -94,11 +94,13 @@ class InstructionMemory:
     def __init__(self, from_ns: int | None, instruction: str, decoding: Decoding = Decoding.CONSTRAINED) -> None:
         """`from_ns`: the newest frame's stamp when the instruction was given; None: the path begins at any frame."""
         self._instruction, self._decoding = instruction, decoding
+        self.waits = False
+        """Whether it begins anew at the end of the turn that its instruction begins with."""
         self.begin(from_ns)
 
     def begin(self, from_ns: int | None) -> None:
         """Forget everything before the frame with this stamp; None: the path begins at any frame."""
-        self.from_ns = from_ns
+        self.from_ns, self.waits = from_ns, False
         self._path = PathMemory()
         self._context = DecodingContext()
         self._turn = TurnEstimator()
@@ -169,7 +171,6 @@ class Instructions:
     def __init__(self, config: ReasoningConfig, slot: SemanticSlot, instruction: str) -> None:
         """`instruction`: the first one."""
         self._config, self._slot = config, slot
-        self._waits: InstructionMemory | None = None  # it begins when the turn has ended
         self.job = self._job(0, instruction, None)
         """The newest job."""
 
@@ -190,8 +191,7 @@ class Instructions:
         """Whether the job's turn has ended; its memory then begins at the newest frame."""
         if self._slot.turn is not None:
             return False
-        if self._waits is job.memory:
-            self._waits = None
+        if job.memory.waits:
             job.memory.begin(newest_ns)
         return True
 
@@ -204,7 +204,7 @@ class Instructions:
                 self._slot.tell(turn)
                 return replace(self.job, number=number)
         memory = InstructionMemory(newest_ns, rest, self._config.decoding)
-        self._waits = None if turn is None else memory
+        memory.waits = turn is not None
         self._slot.tell(turn)
         return Job(number, rest, memory)
 

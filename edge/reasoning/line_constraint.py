@@ -115,15 +115,17 @@ class FormConstraint:
         self._begins = True  # whether the next token begins a line
         self._node: Node = {}  # what may follow; empty outside such a line
         self._kind_known = False  # whether the text has left the tokens that all lines of the kind share
+        self.replaced = False
+        """Whether a choice of the model was replaced in the newest line of a kind."""
 
     def choose(self, token: int) -> int:
         """Return the token to take where the model chooses `token`."""
         if self._begins and token in self._forms.heads:
-            self._node, self._kind_known = {token: self._forms.heads[token]}, False
+            self._node, self._kind_known, self.replaced = {token: self._forms.heads[token]}, False, False
         if self._node:
             self._kind_known = self._kind_known or len(self._node) > 1
-            if token not in self._node:
-                token = next(iter(self._node)) if self._kind_known else token
+            if self._kind_known and token not in self._node:
+                token, self.replaced = next(iter(self._node)), True
             self._node = self._node.get(token, {})
         self._begins = token in self._forms.ends
         return token

@@ -16,16 +16,21 @@ from edge.state.semantic import ToldTurn
 
 _SPACE: Final = r"[\s,]+"
 _POLITE: Final = (
-    r"(?:please|now|okay|ok|all right|(?:hey |hello |hi )?robot|hey|hello|hi|(?:could|would|can) you|i want you to|"
+    r"(?:please|now|okay|ok|all right|robot|hey|hello|hi|(?:could|would|can) you|i want you to|"
     rf"you should|first){_SPACE}"
 )
-_GOAL: Final = r"(?:(?:find|go to|head for|bring yourself to|your goal is|we need you at) the [\w ]{2,60}[.:]\s+)"
+_GOAL: Final = (
+    r"(?:(?:find|your goal is|we need you at) the [\w ]{2,60}[.:]"
+    r"|(?:go to|head for|bring yourself to) the [\w ]{2,60}:)\s+"  # with a full stop, it comes before the turn
+)
 _TURN: Final = (
     r"(?:(?P<around>turn (?:around|round)|make a u-turn)"
     r"|turn (?P<a>left|right) on the spot|turn on the spot to the (?P<b>left|right)|turn to face (?P<c>left|right))"
 )
 _NEXT: Final = r"(?:,? please)?(?:\s*[.,;!?]+\s*|\s+(?=(?:and|then)\s)|\s*$)(?:(?:and then|and|then|after that)[\s,]+)?"
-_FIRST: Final = re.compile(rf"\s*(?:{_POLITE})*(?P<goal>{_GOAL}?)(?:{_POLITE})*{_TURN}{_NEXT}", re.IGNORECASE)
+_FIRST: Final = re.compile(
+    rf"\s*(?:{_POLITE})*(?:(?P<goal>{_GOAL})(?:{_POLITE})*)?{_TURN}{_NEXT}(?!\s*(?:if|once|as soon)\b)", re.IGNORECASE
+)
 
 
 def split_turn(instruction: str) -> tuple[ToldTurn | None, str]:
@@ -35,7 +40,7 @@ def split_turn(instruction: str) -> tuple[ToldTurn | None, str]:
     an empty rest for the turn alone. A goal that is named before the turn stays in the rest.
     """
     found = _FIRST.match(instruction)
-    if found is None:
+    if found is None or (found["goal"] and not instruction[found.end() :].strip()):
         return None, instruction
     side = found["a"] or found["b"] or found["c"]
     turn_rad = math.pi if side is None else math.copysign(math.pi / 2, 1 if side.lower() == LEFT else -1)

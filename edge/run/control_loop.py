@@ -210,7 +210,8 @@ class ControlLoop:
         encoded = self._encode(self._sources.newest_frame())
         encoded_ns = self._clock()
         self.poll_urgent_faults()
-        semantic = self._slot.state
+        turn = self._slot.turn  # before the state: during a turn and after it, none from before it counts
+        semantic = self._slot.state if turn is None else None
         pose = self._sources.history.newest()
         trajectory: npt.NDArray[np.float32] | None = None
         delay_s: float | None = None
@@ -240,7 +241,7 @@ class ControlLoop:
         )
         T_odom_base = None if pose is None else pose.T_odom_base
         waypoints = None if latency is None else leading_waypoints(semantic, latency.offset)
-        command, turn = self._controller.step(inputs, acted_ns), self._slot.turn
+        command = self._controller.step(inputs, acted_ns)
         if turn is not None:
             told = self._turning.step(turn, command, T_odom_base, acted_ns, inputs.speed_scale)
             if told is None:

@@ -201,6 +201,8 @@ class ReasoningLoop:
         """Run one generation if one may start; returns whether a semantic state was published."""
         job, interrupt = self._job, Interrupt()
         if not self._instructions.ready(job, self._ring.newest_ns):
+            self.cycle.pause()
+            self.last_progress_ns = self._clock()  # this wait is no call that hangs
             return False
         job.memory.watch(self._ring)
         outputs = self._advance(starting=job)

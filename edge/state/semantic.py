@@ -121,22 +121,26 @@ class SemanticSlot:
     """The slot of the reasoning thread's newest result; reading and replacing a field are single operations."""
 
     def __init__(self) -> None:
-        self.turn: ToldTurn | None = None
-        """The turn that control makes before reasoning goes on; None: there is none, or it has ended."""
+        self._told: ToldTurn | None = None  # written where instructions come from
+        self._made: ToldTurn | None = None  # written by control alone: neither overwrites the other's turn
         self.state: SemanticState | None = None
         self.drive_until_ns: int | None = None
         """End of the time in which the robot may drive, ns; None: no such end."""
 
+    @property
+    def turn(self) -> ToldTurn | None:
+        """The turn that control makes before reasoning goes on; None: there is none, or it has ended."""
+        turn = self._told
+        return None if turn is self._made else turn
+
     def tell(self, turn: ToldTurn | None) -> None:
-        """Replace the turn; before one, the robot forgets what it was about to do."""
-        self.turn = turn
-        if turn is not None:
-            self.state = None
+        """Replace the turn."""
+        self._told = turn
 
     def end(self, turn: ToldTurn) -> None:
-        """End a turn, unless another one has replaced it; nothing from before it drives the robot."""
-        if self.turn is turn:
-            self.state = self.turn = None
+        """End a turn; nothing from before its end drives the robot."""
+        self.state = None
+        self._made = turn
 
 
 @dataclass(frozen=True)

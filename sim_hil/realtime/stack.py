@@ -186,9 +186,15 @@ class Stack:
         socket.unlink(missing_ok=True)  # left by a killed bridge
         name = f"edge-bridge-{self.runs + 1}"
         command = [*COMMANDS["edge-bridge"], *self._link(), "--json", str(self.result(name))]
-        processors = () if self._watch is None else (max(os.sched_getaffinity(0)),)
+        processors = (max(os.sched_getaffinity(0)),) if self._is_watched() else ()
         bridge = self.bridge = self._children.start(name, command, fifo_priority=BRIDGE_PRIORITY, processors=processors)
         self._children.wait_until(bridge, socket.exists, BRIDGE_TIMEOUT_S, f"socket {socket}", tick)
+
+    def _is_watched(self) -> bool:
+        """Whether the watch for stalls interrupts the bridge: it may use its priority."""
+        with suppress(ProcessLookupError):
+            return self._watch is not None and os.sched_getscheduler(self._watch.process.pid) == os.SCHED_FIFO
+        return False
 
     def start_runner(self, instruction: str) -> Child:
         """Start the runner, which arms and drives by itself (see `armed`)."""

@@ -94,7 +94,7 @@ class TrueProgress(TextConstraint):
 
     def __init__(self, context: DecodingContext, encode: Encode, truth: ReasoningText, end_id: int) -> None:
         self._truth = truth
-        super().__init__(context, encode)
+        super().__init__(replace(context, keeps_form=False), encode)
 
     @property
     def overruled(self) -> bool:
@@ -117,7 +117,7 @@ class TrueDistances(TextConstraint):
     """Replaces the line of objects and openings, and the distance of a plan of the right kind."""
 
     def __init__(self, context: DecodingContext, encode: Encode, truth: ReasoningText, end_id: int) -> None:
-        super().__init__(replace(context, turn=None), encode)
+        super().__init__(replace(context, turn=None, keeps_form=False), encode)
         self._truth = truth
 
     def replace_line(self, line: str) -> Line | None:

@@ -61,6 +61,8 @@ class SemanticMonitor:
         return tuple(findings)
 
     def _count(self, semantic: SemanticState | None) -> None:
+        if semantic is None:
+            self._invalid = 0  # what was decided from those texts drives nothing any more
         if semantic is None or semantic.generation == self._generation:
             return
         self._generation = semantic.generation

@@ -61,19 +61,21 @@ class ArtifactsPolicy:
 
     def __init__(
         self, directory: Path, *, mode: str, latency: LatencyProfile, robot: RobotConfig,
-        switches: SwitchOptions | None = None,
+        switches: SwitchOptions | None = None, turns_as_told: bool = True,
     ) -> None:  # fmt: skip
         """Verify, open and prove the graphs within limits of time and memory.
 
         Raises ArtifactError, or ConditionsError for a mode that they do not support. A graph that hangs ends the
         process with EXIT_REFUSED. `switches`: decoding rules and recoveries; None: the manifest's, without halting at
-        the goal.
+        the goal. `turns_as_told`: whether control makes the turn that an instruction begins with, unless the recoveries
+        are off; otherwise the model reads it.
         """
         self._artifacts = load_artifacts(directory)
         check_suits(self._artifacts, mode)
         self._mode, self._latency, self._robot = Mode(mode), latency, robot
         runtime, asked = self._artifacts.runtime, switches or SwitchOptions()
         self._switches = asked.over(runtime.switches, stand_at_goal=False)
+        self._turns_as_told = turns_as_told and self._switches.turns_as_told
         opened = open_proven(self._artifacts, threads=1)
         self._model, self.language = opened.policy, opened.language
         with opened.guard.stage("warming up", WARM_UP_S):
@@ -108,7 +110,7 @@ class ArtifactsPolicy:
             self._guess_for_the_device()
         self._drive = _Drive(
             self._artifacts, self._model, self.language, self._robot, self._mode, instruction, draw, self._switches,
-            self.recorder,
+            self._turns_as_told, self.recorder,
         )  # fmt: skip
         if self.recorder is not None:
             self.recorder.put("/run", START_NS, self._run_record(instruction, episode.robot))
@@ -163,7 +165,7 @@ class _Drive:
 
     def __init__(
         self, artifacts: Artifacts, model: Model, language: LanguageModel, robot: RobotConfig, mode: Mode,
-        instruction: str, draw: Any, switches: Switches, recorder: RecordSink | None,
+        instruction: str, draw: Any, switches: Switches, turns_as_told: bool, recorder: RecordSink | None,
     ) -> None:  # fmt: skip
         runtime = artifacts.runtime
         if runtime.tick_period_ms * 1_000_000 != CONTROL_PERIOD_NS:
@@ -181,9 +183,7 @@ class _Drive:
         self._reasoner = VirtualTimeReasoner(
             GenerationModels(language, model),
             shared,
-            ReasoningConfig(
-                runtime.frame_offsets_s, runtime.max_new_tokens, mode, switches.decoding, switches.turns_as_told
-            ),
+            ReasoningConfig(runtime.frame_offsets_s, runtime.max_new_tokens, mode, switches.decoding, turns_as_told),
             instruction,
             draw,
             recorder,

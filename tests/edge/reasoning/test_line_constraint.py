@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from edge.artifacts.manifest import Artifacts
 from edge.inference.language import LanguageModel
-from edge.reasoning.decoding_rules import DecodingContext
+from edge.reasoning.decoding_rules import DecodingContext, TextConstraint
 from edge.reasoning.line_constraint import FormConstraint, LineConstraint, TextForms
 from edge.state.reasoning_text import (
     AREAS,
@@ -111,6 +111,13 @@ def test_a_text_that_follows_the_grammar_is_left_alone(situation: Situation, pla
 )
 def test_a_line_that_leaves_the_grammar_becomes_one_that_begins_like_it(begun: str, line: str) -> None:
     assert kept(begun + 60 * "?").startswith(line + "\n?")
+
+
+def test_a_plan_that_was_completed_for_the_model_is_not_the_models() -> None:
+    for written, its_own in (("Plan: stop in 4 m.\n", True), ("Plan: stop in (1.0, 0.0)", False)):
+        constraint = TextConstraint(DecodingContext(keeps_form=True), letters, FORMS)
+        text = "".join(chr(constraint.choose(ord(letter))) for letter in written).split("\n")[0]
+        assert constraint.replace_line(text) is None and constraint.has_plan is its_own
 
 
 @pytest.mark.parametrize("text", ["Progress: what?\n", "no such line\n", "Objects: a Plan: x\n", ""])

@@ -14,9 +14,9 @@ from edge.reasoning.generation_cycle import ReasoningConfig
 from edge.reasoning.instruction_state import Instructions
 from edge.reasoning.told_turn import split_turn
 from edge.state.ring import EncodedFrame
-from edge.state.semantic import SemanticSlot
+from edge.state.semantic import SemanticSlot, ToldTurn
 from sim_hil.benchmark.language.instruction_words import AROUND
-from tests.support.runner.reasoning_bench import KV, Bench
+from tests.support.runner.reasoning_bench import KV, Bench, Clock
 
 CONFIG = ReasoningConfig((0.0, 3.0), 4)
 
@@ -33,6 +33,7 @@ CONFIG = ReasoningConfig((0.0, 3.0), 4)
         ("Now, turn on the spot to the right. Stop at the bench.", -pi / 2, "Stop at the bench."),
         ("Turn to face left and follow the corridor", pi / 2, "Follow the corridor"),
         ("Find the red bench. Turn around. Go on.", pi, "Find the red bench. Go on."),
+        ("hey robot, hello robot, please turn around", pi, ""),
         ("robot, go to the drum: turn round, then walk along the row", pi, "Go to the drum: walk along the row"),
         ("Turn around!", pi, ""),
         ("please turn around", pi, ""),
@@ -46,7 +47,9 @@ def test_a_clause_at_the_beginning_is_split_off(text: str, turn_rad: float, rest
 @pytest.mark.parametrize(
     "text",
     ["Turn around the corner and stop.", "Turn left, then go straight.", "Leave the room and turn around.",
-     "Go around the table.", "Take the first right turn, around the plant.", "Do not turn around.", ""],
+     "Go around the table.", "Take the first right turn, around the plant.", "Do not turn around.", "",
+     "Go to the bench. Turn around and come back.", "Find the red bench. Turn around.",
+     "Turn around, if you see a door.", "hey robot " * 39 + "go", "please " * 57 + "x"],
 )  # fmt: skip
 def test_any_other_instruction_is_left_whole(text: str) -> None:
     assert split_turn(text) == (None, text)
@@ -95,10 +98,30 @@ def test_an_instruction_without_a_turn_ends_the_one_before_it() -> None:
     assert slot.turn is None and job.instruction == "Go to the door." and made.ready(job, 8) and job.memory.from_ns == 4
 
 
+def test_the_end_of_a_turn_does_not_end_the_one_that_has_replaced_it() -> None:
+    slot, first, second = SemanticSlot(), ToldTurn(pi), ToldTurn(pi)
+    slot.tell(first)
+    slot.tell(second)
+    slot.end(first)
+    assert slot.turn is second
+    slot.end(second)
+    assert slot.turn is None
+
+
 def test_without_recoveries_the_model_reads_the_turn() -> None:
     slot = SemanticSlot()
     made = Instructions(replace(CONFIG, turns_as_told=False), slot, "Turn around. Go to the bench.")
     assert made.job.instruction == "Turn around. Go to the bench." and slot.turn is None
+
+
+def test_waiting_for_a_turn_is_no_call_that_hangs_and_forgets_the_texts_that_held_the_robot() -> None:
+    clock = Clock()
+    bench = Bench(clock=clock)
+    bench.cycle.invalid_in_a_row = 3
+    bench.loop.submit("Turn around. Go to the bench.")
+    clock.s += 60.0
+    assert not bench.loop.step()
+    assert bench.loop.last_progress_ns == clock() and bench.cycle.invalid_in_a_row == 0
 
 
 def test_reasoning_waits_for_the_turn_and_sees_nothing_from_before_its_end() -> None:

@@ -242,6 +242,17 @@ def test_a_robot_makes_the_turn_that_it_is_told_before_anything_drives_it(bench:
     assert 0.0 < bench.sink.commands[-1][1] <= LIMITS.accel_mps2 * PERIOD_NS / 1e9, "from a standstill"
 
 
+def test_a_text_that_is_published_during_a_turn_drives_neither_then_nor_after_it(bench: Bench) -> None:
+    turn = ToldTurn(math.pi)
+    bench.slot.tell(turn)
+    bench.think(0)  # it was on its way when the turn was told
+    bench.see()
+    assert bench.tick() == (0.0, TOLD) and bench.policy.calls == []
+    bench.slot.end(turn)
+    bench.see()
+    assert bench.tick() == (0.0, "no-semantic-state")
+
+
 def test_another_instruction_ends_a_turn_that_is_under_way(bench: Bench) -> None:
     bench.slot.tell(ToldTurn(math.pi))
     bench.see()

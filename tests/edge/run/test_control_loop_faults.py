@@ -16,12 +16,14 @@ import numpy as np
 import pytest
 
 from edge.core.geometry import SE2
+from edge.motion.turn_on_the_spot import TOLD
 from edge.run.control_loop import ControlStatistics
 from edge.run.result import plan_fault
 from edge.safety.faults.findings import Finding
 from edge.safety.faults.table import FAULTS
 from edge.safety.monitors.semantic import SemanticConfig
 from edge.state.pose_history import StampedPose
+from edge.state.semantic import ToldTurn
 from tests.support.runner.control_bench import LIMITS, MS, PERIOD_NS, Bench
 from tests.support.runner.injections import (
     BRIDGE_NS,
@@ -250,6 +252,19 @@ def test_three_invalid_texts(judged: Bench) -> None:
     check_zero_in_time(judged, "semantic-text-invalid", invalid_text)
     judged.think(99, text="waypoints: (1.00, 0.00) (2.00, 0.00) (3.00, 0.00)")
     judged.drive()
+
+
+def test_a_turn_that_is_told_is_made_although_the_texts_before_it_were_invalid(judged: Bench) -> None:
+    for _ in range(4):
+        invalid_text(judged)
+        judged.tick()
+    assert found(judged, "semantic-text-invalid")
+    judged.slot.tell(ToldTurn(1.0))
+    reasons = []
+    for _ in range(20):
+        judged.see()
+        reasons.append(judged.tick()[1])
+    assert reasons[0] == "semantic-text-invalid" and reasons[-1] == TOLD
 
 
 def test_three_invalid_texts_that_were_never_published(judged: Bench) -> None:

@@ -140,7 +140,10 @@ class PolicyDriver:
     def __init__(self, options: PolicyOptions, episode: Episode, rng: np.random.Generator) -> None:
         latency = draw_latency(options.latency_mean_s, rng)
         directory = Path(options.artifacts)
-        self._policy = ArtifactsPolicy(directory, mode="async", latency=latency, robot=robot_config())
+        # The expert may have made the turn of an instruction already, in a stretch of its own.
+        self._policy = ArtifactsPolicy(
+            directory, mode="async", latency=latency, robot=robot_config(), turns_as_told=False
+        )
         if self._policy.manifest_sha256 != options.manifest_sha256:
             raise ArtifactError(f"{directory}: not the artifacts that this round was started with")
         self.name = f"{POLICY_DRIVER}{options.manifest_sha256[:12]}"
