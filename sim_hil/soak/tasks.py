@@ -30,7 +30,7 @@ _SLOW: Final = 0.6  # mean speed among people as a share of the speed limit
 class SoakTask:
     """Task to drive from `start` (x m, y m, heading rad) to `goal_xy` (m); `shortest_m`: shortest feasible path.
 
-    `first`: how the robot must turn on the spot to face its route (`tasks.facing`). It is told so, outside rooms.
+    `first`: how the robot must turn on the spot to face its route (`tasks.facing`).
     """
 
     number: int

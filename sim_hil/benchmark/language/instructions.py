@@ -48,14 +48,15 @@ class _Writer:
 def wordings(route: RouteDescription, count: int, seed: int, *, held_out: bool, first: str = "") -> list[str]:
     """Return `count` different wordings of a route, from the benchmark's patterns (`held_out`) or training's.
 
-    `first`: how the robot must turn on the spot before the route begins, as `tasks.facing` gives it. Deterministic per
-    seed. Raises WordingError if the grammar does not yield enough.
+    `first`: how the robot must turn on the spot before the route begins, as `tasks.facing` gives it; training's
+    wordings may leave it out in a room. Deterministic per seed. Raises WordingError if the grammar does not yield
+    enough.
     """
     rng = np.random.default_rng((seed, 5))
     found: list[str] = []
     patterns: set[str] = set()
     for attempt in range(400 + 60 * count):
-        text = _compose(_Writer(rng), route, first)
+        text = _compose(_Writer(rng), route, first, told=held_out)
         if len(text.split()) > MAX_WORDS or is_held_out(text) != held_out or text in found:
             continue
         # Prefer a new pattern for each, because wordings that differ in one word add little.
@@ -81,8 +82,8 @@ def is_held_out(text: str) -> bool:
     return int.from_bytes(digest[:4], "big") < HELD_OUT_SHARE * 2**32
 
 
-def _compose(w: _Writer, route: RouteDescription, first: str) -> str:
-    clauses = [*_turn_on_the_spot(w, route, first), *_steps(w, route)]
+def _compose(w: _Writer, route: RouteDescription, first: str, *, told: bool) -> str:
+    clauses = [*_turn_on_the_spot(w, route, first, told=told), *_steps(w, route)]
     goal = route.goal_bare if w.chance(0.5) else route.goal_name
     style = w.pick("route", "route", "route", "goal", "short")
     if style == "goal":
@@ -94,7 +95,8 @@ def _compose(w: _Writer, route: RouteDescription, first: str) -> str:
         body = _joined(w, [*clauses, *_last_leg(w, route)])
         if not body:
             body = _straight(w, route.goal_area_kind, route.goal_area_name)
-        return _polite(w, f"{opening}{w.pick('. ', ': ')}{body}{w.pick(' and ', ', then ', '. Then ')}{end}")
+        after = ": " if first else w.pick(". ", ": ")  # a turn after "go to the bench." would come after the way there
+        return _polite(w, f"{opening}{after}{body}{w.pick(' and ', ', then ', '. Then ')}{end}")
     stop = _stop(w, route, goal)
     if style == "short":
         parts = [*clauses, w.pick(f"stop at the {goal}", f"stop by the {goal}", f"then the {goal}")]
@@ -189,9 +191,9 @@ def _stop(w: _Writer, route: RouteDescription, goal: str) -> str:
     )  # fmt: skip
 
 
-def _turn_on_the_spot(w: _Writer, route: RouteDescription, first: str) -> list[str]:
-    """Return the clause by which the robot faces its route; one in a room is often told to leave it, and no more."""
-    if not first or (route.leaves_room and (first != AROUND or w.chance(0.5))):
+def _turn_on_the_spot(w: _Writer, route: RouteDescription, first: str, *, told: bool) -> list[str]:
+    """Return the clause by which the robot faces its route; unless `told`, it may be left out in a room."""
+    if not first or (not told and route.leaves_room and (first != AROUND or w.chance(0.5))):
         return []
     if first == AROUND:
         return [w.pick("turn around", "turn round")]

@@ -8,6 +8,7 @@ from math import cos, pi, radians, sin
 import numpy as np
 import pytest
 
+from edge.reasoning.told_turn import split_turn
 from sim_hil import layouts
 from sim_hil.benchmark.language.instruction_reading import Claim, read, untrue
 from sim_hil.benchmark.language.instruction_words import AROUND
@@ -192,6 +193,7 @@ def test_a_robot_that_does_not_face_its_route_is_told_how_to_turn(first: str, wa
     for text in wordings(way, 20, 3, held_out=False, first=first):
         assert [claim.side for claim in read(text) if claim.kind == "face"] == [first]
         assert untrue(text, way, first) == []
+        assert split_turn(text)[0] is not None, "the runner makes the turn"
         assert untrue(text, way) == [f"turn on the spot: expected none, found {first}"]
         assert any(f"must turn {first}" in line for line in untrue(wordings(way, 1, 3, held_out=False)[0], way, first))
 
@@ -201,6 +203,8 @@ def test_a_robot_in_a_room_may_be_told_to_leave_it_and_no_more(way: RouteDescrip
     claims = [read(text) for text in wordings(inside, 40, 3, held_out=False, first=AROUND)]
     told = sum(any(claim.kind == "face" for claim in each) for each in claims)
     assert 8 < told < 32
+    assert all(any(claim.kind == "face" for claim in read(text))
+               for text in wordings(inside, 20, 3, held_out=True, first=AROUND))  # fmt: skip
     assert untrue(wordings(inside, 1, 3, held_out=False)[0], inside, AROUND) == []
 
 
