@@ -34,6 +34,7 @@ class BusLink:
         self._failure: Exception | None = None
         self.sent = 0
         self.unsent = 0
+        self.received = 0
         self._threads = [
             threading.Thread(target=work, name=f"can-{work.__name__}", daemon=True)
             for work in (self._listen, self._send_all)
@@ -48,8 +49,8 @@ class BusLink:
 
     @property
     def pending(self) -> int:
-        """Number of frames waiting to be sent."""
-        return self._to_send.qsize()
+        """Number of frames that are not sent yet, with the one being sent."""
+        return self._to_send.unfinished_tasks
 
     def send(self, frame: Frame) -> None:
         """Queue a frame; if the queue is full, because the line takes no data, the frame counts as `unsent`."""
@@ -98,6 +99,7 @@ class BusLink:
     def _note(self, message: can.Message) -> None:
         frame = Frame(message.arbitration_id, bytes(message.data[:8]), error=message.is_error_frame)
         self._received.append((time.monotonic_ns(), frame))
+        self.received += 1
         self._arrived.set()
 
     def _send_all(self) -> None:
@@ -116,6 +118,7 @@ class BusLink:
                 self.sent += 1
             except (can.CanError, OSError):  # no receiver, full queue or bus off: the frame is lost, as on a real bus
                 self.unsent += 1
+            self._to_send.task_done()
 
 
 def _is_ours(message: can.Message) -> bool:

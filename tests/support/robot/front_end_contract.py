@@ -75,11 +75,15 @@ class Rig:
             if self.steps % tenth == 0:
                 each_tenth()
                 self.client.poll()
+                self.let_arrive()
             if self.steps % SERVE_EVERY == 0:
                 self.front_end.serve()
             self.simulation.step()
             self.steps += 1
             self.front_end.publish(self.steps, self.steps * self.simulation.dt_s)
+
+    def let_arrive(self) -> None:
+        """Wait until the front end has what the client has sent; for a wire on which that may take long."""
 
     def tell(self, say: Callable[[], object]) -> list[ReceivedCommand]:
         """Let the client say something and the robot hear it."""

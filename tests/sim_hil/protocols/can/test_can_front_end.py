@@ -70,7 +70,11 @@ class ContractClient:
 
 
 class PatientRig(Rig):
-    """Lets the wire keep up: the robot's time passes many times faster here than a serial line carries frames."""
+    """Lets the wire keep up: the robot's time passes many times faster here than a serial line carries frames.
+
+    It waits in both directions: 100 ms of the robot's time without a command stop the base, 500 ms without a heartbeat
+    disarm it.
+    """
 
     def run(self, seconds: float, each_tenth: Callable[[], object] = lambda: None) -> None:
         steps, tenth = round(seconds * self.simulation.rate_hz), self.simulation.rate_hz // 10
@@ -78,9 +82,18 @@ class PatientRig(Rig):
             chunk = min(steps, tenth - self.steps % tenth)
             super().run(chunk / self.simulation.rate_hz, each_tenth)
             steps -= chunk
-            deadline = time.monotonic() + 10.0
-            while self.front_end.pending and time.monotonic() < deadline:  # type: ignore[attr-defined]
-                time.sleep(0.001)
+            _wait_until(lambda: not self.front_end.pending)  # type: ignore[attr-defined]
+
+    def let_arrive(self) -> None:
+        client, base = self.client.link, self.front_end._link  # type: ignore[attr-defined]
+        _wait_until(lambda: not client.pending and base.received >= client.sent)
+
+
+def _wait_until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 10.0
+    while not condition():
+        assert time.monotonic() < deadline, "the wire did not carry what was sent"
+        time.sleep(0.001)
 
 
 def open_rig(link: str, client: BusAddress, **changes: object) -> Rig:
