@@ -121,6 +121,7 @@ def check(args: argparse.Namespace) -> None:
     if args.domain is not None and not 0 <= args.domain <= MAX_DOMAIN:
         raise SoakInputError(f"--domain: expected 0 to {MAX_DOMAIN}, found {args.domain}")
     for scene in args.scene or ():
-        load_scene(scene)
+        if not load_scene(scene).landmarks():
+            raise SoakInputError(f"--scene {scene}: expected landmarks to drive to, found none; give another scene")
     if args.speed_limit is not None and not 0.02 <= args.speed_limit <= 1.5:
         raise SoakInputError(f"--speed-limit: expected 0.02 to 1.5 m/s, found {args.speed_limit}")

@@ -258,6 +258,7 @@ def test_a_time_has_a_unit_or_is_in_seconds(text: str, seconds: float) -> None:
         (["--duration", "1s"], "--duration"),
         (["--leg", "1s"], "--leg"),
         (["--scene", "nowhere"], "nowhere"),
+        (["--scene", "office", "--scene", "corridor"], "--scene corridor"),  # hours later, without this check
         (["--faults", "absent.toml"], "absent.toml"),
         (["--budget", "absent.toml"], "absent.toml"),
         (["--speed-limit", "9"], "--speed-limit"),
