@@ -239,7 +239,7 @@ class CanFrontEnd(CameraFrontEnd):
 
     @property
     def pending(self) -> int:
-        """Number of frames waiting to be sent."""
+        """Number of frames that are not sent yet."""
         return 0 if self._link is None else self._link.pending
 
     def _read(self) -> Sensors:
