@@ -184,6 +184,9 @@ class Injector:
         self._due_ns: int | None = None
         self._end_ns: int | None = None
         self._number = 0
+        self._put_off: list[Injection] = []
+        self.stops_from_ns = 0
+        """Faults that end a run and are due before this time are put off until it."""
         self.newest: Injection | None = None
         """The last injection; `newest_ns` is the time until which it was active."""
         self.newest_ns = 0
@@ -204,7 +207,11 @@ class Injector:
         elif self._due_ns is None:
             self._due_ns = now_ns + round(self._next.gap_s * 1e9)
         elif now_ns >= self._due_ns:
-            self._on(now_ns)
+            if self._next.fault.expect == "stop" and now_ns < self.stops_from_ns:
+                self._put_off.append(self._next)
+                self._draw(now_ns)
+            else:
+                self._on(now_ns)
 
     def clear(self) -> None:
         """Switch everything off after the end of a runner; the next gap begins when the robot is driven again."""
@@ -236,7 +243,12 @@ class Injector:
         if send and not fault.once:
             assert self._stack.faults is not None
             self._stack.faults.ask(fault.inject, on=False)
-        self._next, self._end_ns, self._due_ns = self._schedule.next(), None, None
+        self._draw(now_ns)
+
+    def _draw(self, now_ns: int) -> None:
+        ready = self._put_off and now_ns >= self.stops_from_ns
+        self._next = self._put_off.pop(0) if ready else self._schedule.next()
+        self._end_ns = self._due_ns = None
 
     def _take(self, answer: dict[str, Any]) -> None:
         if "error" in answer:

@@ -27,6 +27,7 @@ from sim_hil.realtime.stack import Stack, StackOptions
 from sim_hil.realtime.truth import TruthTail
 from sim_hil.soak.faults import FaultMenu, FaultSchedule, Injector
 from sim_hil.soak.tasks import Journey, SoakTask, TaskRun
+from sim_hil.soak.verdict import SHORTEST_S, WARM_UP_S
 
 SAMPLE_NS: Final = 1_000_000_000
 POLL_S: Final = 0.05
@@ -43,6 +44,8 @@ CONTACT_STOPS: Final = frozenset(
     ("odometry-stays-frozen", "robot-stays-blocked", "odometry-speed-mismatch", "tipped-over")
 )
 """Faults that stop a robot after a contact."""
+JUDGED_LIFE_S: Final = WARM_UP_S + SHORTEST_S + 60.0
+"""Life of a runner, s, from which its growth can be judged; faults that end it are put off until then."""
 SAMPLES, EVENTS, LEG = "samples.jsonl", "events.jsonl", "leg.json"
 
 
@@ -142,12 +145,19 @@ class Leg:
             self._note("life_begin", run=self._stack.runs)
             self._await_arming()
             if self._armed:
+                self._put_off_stops(time.monotonic_ns())
                 self._begin_task(task)
             why = self._drive() if self._armed else None
             if why is not None:
                 return why
             if self._life_over():
                 return "stuck"
+
+    def _put_off_stops(self, now_ns: int) -> None:
+        """Let a new runner live until its growth can be judged, where the leg is long enough for that."""
+        if self._injector is not None:
+            enough = self.left_s(now_ns) > JUDGED_LIFE_S
+            self._injector.stops_from_ns = now_ns + round(JUDGED_LIFE_S * 1e9) if enough else now_ns
 
     def _await_arming(self) -> None:
         runner = self._stack.runner

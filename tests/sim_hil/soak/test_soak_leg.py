@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import math
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,6 +15,7 @@ from edge.run.say import SayError
 from sim_hil.realtime.stack import StackOptions
 from sim_hil.realtime.truth import TruePose, read_lines
 from sim_hil.soak import leg as soak_leg
+from sim_hil.soak.faults import FaultMenu, SoakFault
 from sim_hil.soak.leg import CONTACT, EVENTS, Leg, LegOptions, explained_end
 from sim_hil.soak.tasks import SoakTask
 
@@ -32,8 +35,40 @@ class Clock:
         self.now_ns += round(seconds * S)
 
 
+MakeLeg = Callable[..., Leg]
+
+
+@pytest.fixture
+def make_leg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> MakeLeg:
+    """Return a function that makes a leg of a stack whose processes run for ever and whose robot stands."""
+
+    def nothing(*_: object, **__: object) -> int:
+        return 0
+
+    def make(clock: Clock, duration_s: float, *, menu: FaultMenu | None = None, end_s: float = math.inf) -> Leg:
+        truth = SimpleNamespace(newest=pose, update=lambda: [TruePose(clock.now_ns, 0, 0, 0, ())])
+        monkeypatch.setattr(soak_leg, "time", clock)
+        monkeypatch.setattr(soak_leg, "Stack", lambda _: stack)
+        monkeypatch.setattr(soak_leg, "TruthTail", lambda _: truth)
+        options = LegOptions(
+            1, 0, duration_s, 0.8, StackOptions(tmp_path, tmp_path, "office", (0.0, 0.0, 0.0), 0, 0, 1)
+        )
+        journey: Any = SimpleNamespace(next=lambda _at: TASK)
+        return Leg(options, journey, menu, stopped=lambda: clock.now_ns > end_s * S, show_status=lambda _: None)
+
+    calls = ("watch_stalls", "start_robot", "start_bridge", "start_runner", "end", "__exit__")
+    running = {name: SimpleNamespace(running=True) for name in ("robot", "bridge", "runner")}
+    values: dict[str, Any] = {"trace": tmp_path / "t", "instructions": tmp_path / "say", "runs": 1}
+    values["faults"] = SimpleNamespace(answers=tuple, ask=nothing)
+    stack = type("Stack", (), {**dict.fromkeys(calls, nothing), "__enter__": nothing, "armed": lambda _: True})()
+    for name, value in {**running, **values, "processes": dict}.items():
+        setattr(stack, name, value)
+    pose = TruePose(0, 0, 0, 0, ())
+    return make
+
+
 def test_an_instruction_is_sent_again_to_a_runner_too_busy_to_answer(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make_leg: MakeLeg
 ) -> None:
     clock, sent_ns = Clock(), list[int]()
 
@@ -43,30 +78,26 @@ def test_an_instruction_is_sent_again_to_a_runner_too_busy_to_answer(
             raise SayError("no answer")
         return "accepted"
 
-    def nothing(*_: object) -> int:
-        return 0
-
-    calls = ("watch_stalls", "start_robot", "start_bridge", "start_runner", "end", "__exit__")
-    running = {name: SimpleNamespace(running=True) for name in ("robot", "bridge", "runner")}
-    values: dict[str, Any] = {"trace": tmp_path / "t", "instructions": tmp_path / "say", "runs": 1}
-    stack = type("Stack", (), {**dict.fromkeys(calls, nothing), "__enter__": nothing, "armed": lambda _: True})()
-    for name, value in {**running, **values, "processes": dict}.items():
-        setattr(stack, name, value)
-    pose = TruePose(0, 0, 0, 0, ())
-    truth = SimpleNamespace(newest=pose, update=lambda: [TruePose(clock.now_ns, 0, 0, 0, ())])
-    monkeypatch.setattr(soak_leg, "time", clock)
     monkeypatch.setattr(soak_leg, "say", say)
-    monkeypatch.setattr(soak_leg, "Stack", lambda _: stack)
-    monkeypatch.setattr(soak_leg, "TruthTail", lambda _: truth)
-    options = LegOptions(1, 0, 15.0, 0.8, StackOptions(tmp_path, tmp_path, "office", (0.0, 0.0, 0.0), 0, 0, 1))
-    journey: Any = SimpleNamespace(next=lambda _at: TASK)
-    leg = Leg(options, journey, None, stopped=lambda: False, show_status=lambda _: None)
 
-    assert leg.run() == "duration"
+    assert make_leg(clock, 15.0).run() == "duration"
 
     kinds = [event["kind"] for event in read_lines(tmp_path / EVENTS) if event["kind"].startswith(("task", "not"))]
     assert kinds[:6] == ["task_begin", "task_end", "not_told", "not_told", "not_told", "task_begin"]
     assert all(b - a >= S for a, b in itertools.pairwise(sent_ns[:4]))
+
+
+@pytest.mark.parametrize(("duration_s", "injected"), [(600.0, True), (7200.0, False)])
+def test_a_leg_long_enough_to_judge_growth_has_no_fault_that_ends_the_run_at_its_begin(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make_leg: MakeLeg, duration_s: float, injected: bool
+) -> None:
+    monkeypatch.setattr(soak_leg, "say", lambda *_: "accepted")
+    menu = FaultMenu((20.0, 30.0), (SoakFault("robot reports an error", "error-code", (1.0, 1.0), 1.0, "", "stop"),))
+
+    assert make_leg(Clock(), duration_s, menu=menu, end_s=60.0).run() == "stopped"
+
+    kinds = [event["kind"] for event in read_lines(tmp_path / EVENTS)]
+    assert ("fault_on" in kinds) == injected
 
 
 @pytest.mark.parametrize(

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from edge.safety.faults.table import FAULTS, Action
-from sim_hil.soak.faults import DEFAULT_MENU, FaultMenu, FaultSchedule, SoakFault, SoakInputError, load_menu
+from sim_hil.soak.faults import DEFAULT_MENU, FaultMenu, FaultSchedule, Injector, SoakFault, SoakInputError, load_menu
 
 ONE = """
 format = 1
@@ -46,6 +48,23 @@ def test_faults_are_drawn_in_proportion_to_their_weights() -> None:
     schedule = FaultSchedule(FaultMenu((1.0, 1.0), (rare, often)), 0, 1)
     names = [schedule.next().fault.name for _ in range(1000)]
     assert 820 < names.count("often") < 960
+
+
+def test_faults_that_end_the_run_are_put_off_until_they_may_come_and_none_is_lost() -> None:
+    lasting = SoakFault("camera", "camera-stop", (1.0, 1.0), 9.0, "", "zero")
+    ending = SoakFault("error", "error-code", (1.0, 1.0), 1.0, "", "stop")
+    schedule = FaultSchedule(FaultMenu((5.0, 5.0), (lasting, ending)), 0, 1)
+    stack: Any = SimpleNamespace(faults=SimpleNamespace(answers=tuple, ask=lambda *_, **__: None))
+    injected: list[tuple[str, int]] = []
+    now_s = 0
+    injector = Injector(stack, schedule, lambda kind, **about: injected.append((about["name"] + kind, now_s)))
+    injector.stops_from_ns = round(1000 * 1e9)
+    for now_s in range(1500):
+        injector.step(round(now_s * 1e9))
+
+    ended_s = [at_s for name, at_s in injected if name == "errorfault_on"]
+    assert min(ended_s) >= 1000
+    assert len(ended_s) > 15, "those of 1,000 s, about one in ten of 140, and of 500 s more"
 
 
 def test_default_faults_expect_the_action_of_the_fault_table() -> None:
