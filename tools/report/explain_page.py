@@ -71,6 +71,7 @@ def write_page(page: Path, log: Path, flight: Flight, found: Sequence[Explanatio
         instruction=flight.instruction,
         new_instructions=[(flight.seconds(at_ns), text) for at_ns, text in flight.new_instructions],
         source=str(log),
+        damage=flight.notice,
         truth=bool(flight.truths),
         tiles=tiles,
         items=cards(log, flight, found),

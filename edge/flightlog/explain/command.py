@@ -46,7 +46,10 @@ _print = messages("edge-replay explain")
 
 
 def as_result(path: Path, flight: Flight, found: Sequence[Explanation]) -> dict[str, Any]:
-    """Return the explanations for --json; `decisive`: index of the event that cost the goal, None without one."""
+    """Return the explanations for --json.
+
+    `decisive`: index of the event that cost the goal, None without one; `damage`: one line, None for a whole log.
+    """
     decisive = deciding(flight, found)
     return {
         "file": str(path),
@@ -55,6 +58,7 @@ def as_result(path: Path, flight: Flight, found: Sequence[Explanation]) -> dict[
             {"at_s": round(flight.seconds(at_ns), 1), "instruction": text} for at_ns, text in flight.new_instructions
         ],
         "duration_s": round(flight.seconds(flight.end_ns), 1),
+        "damage": flight.notice,
         "truth": bool(flight.truths),
         "events": [each.as_json() for each in found],
         "causes": dict(Counter(each.verdict.cause for each in found)),

@@ -99,8 +99,13 @@ _LONGEST_S = 1e9  # beyond every log
 _print = messages("edge-replay")
 
 
-def replay(path: Path, artifacts: Artifacts, run: RecordedRun, from_s: float, to_s: float) -> tuple[Comparison, int]:
-    """Replay a log; return the comparison and the log's tick count. Raises RecordingError, ArtifactError, OSError."""
+def replay(
+    path: Path, artifacts: Artifacts, run: RecordedRun, from_s: float, to_s: float
+) -> tuple[Comparison, int, str | None]:
+    """Replay a log; return the comparison, the log's tick count and one line about its damage, None for a whole log.
+
+    Raises RecordingError, ArtifactError, OSError.
+    """
     opened = open_proven(artifacts)
     first_ns = next((event.now_ns for event in read_events(path) if isinstance(event, RecordedTick)), None)
     if first_ns is None:
@@ -127,9 +132,7 @@ def replay(path: Path, artifacts: Artifacts, run: RecordedRun, from_s: float, to
                 found = replayer.comparison
                 at_s = (event.now_ns - first_ns) / 1e9
                 _print(f"at {at_s:.0f} s of the log: {found.ticks} ticks and {found.generations} generations run again")
-    if damages:
-        _print(damage_notice(damages, first_ns))
-    return replayer.comparison, ticks
+    return replayer.comparison, ticks, damage_notice(damages, first_ns) if damages else None
 
 
 def verdict(found: Comparison, tolerance: Tolerance) -> tuple[str, ...]:
@@ -256,7 +259,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         raise OptionError(f"--from {args.from_s:g} --to {args.to_s:g}: expected 0 or more, and --to after --from")
     run = read_run(args.file)
     artifacts, same = _open(args, run)
-    found, ticks = replay(args.file, artifacts, run, args.from_s, args.to_s)
+    found, ticks, damage = replay(args.file, artifacts, run, args.from_s, args.to_s)
+    if damage is not None:
+        _print(damage)
     beyond = verdict(found, tolerance)
     result = {
         "file": str(args.file),
@@ -264,6 +269,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "artifacts": str(args.artifacts),
         "same_artifacts": same,
         "mode": run.mode,
+        "damage": damage,
         "tolerance": vars(tolerance),
         **as_result(found, ticks, beyond),
         "wall_s": round((time.monotonic_ns() - started_ns) / 1e9, 3),

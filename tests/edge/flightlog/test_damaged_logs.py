@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,9 +15,11 @@ from edge.flightlog.explain import command, video
 from edge.flightlog.part import LogPart, PartFile
 from edge.flightlog.reader import Damage, read_messages
 from edge.flightlog.replay import command as replay
+from edge.flightlog.replay.policy import Comparison
 from tests.edge.flightlog.test_log_schemas import SAMPLES
 from tests.support.runner import synthetic_run
 from tests.support.runner.explained_flights import at
+from tools.report import explain_page
 
 ZSTD = b"\x28\xb5\x2f\xfd"
 """First bytes of a chunk's data."""
@@ -79,41 +82,63 @@ def test_a_part_without_its_end_before_another_part_is_damaged(tmp_path: Path) -
     assert [(each.path, each.ends) for each in damages] == [(path, True)]
 
 
-def replayed(log: Path) -> int:
-    replay.replay(log, None, None, 0.0, 9.0)  # type: ignore[arg-type]
-    return EXIT_DONE
+Damaged = Callable[[Path, Path], int]
 
 
-@pytest.mark.parametrize(
-    "main",
-    [
-        lambda log: command.main([str(log)]),
-        lambda log: video.main([str(log), "--out", str(log.with_name("film.mp4"))]),
-        replayed,
-    ],
-    ids=["explain", "video", "replay"],
-)
+def explained(log: Path, out: Path) -> int:
+    return command.main([str(log), "--json", str(out)])
+
+
+def replayed(log: Path, out: Path) -> int:
+    replay.main([str(log), "--artifacts", "x", "--json", str(out)])
+    return EXIT_DONE  # nothing is compared here
+
+
+def filmed(log: Path, _out: Path) -> int:
+    return video.main([str(log), "--out", str(log.with_name("film.mp4"))])
+
+
+@pytest.fixture
+def nothing_runs_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let `edge-replay` read a log without artifacts."""
+    monkeypatch.setattr(replay, "_open", lambda *_: (None, True))
+    monkeypatch.setattr(replay, "open_proven", lambda _: SimpleNamespace(policy=None, language=None))
+    replayer = SimpleNamespace(step=lambda _: None, comparison=Comparison())
+    monkeypatch.setattr(replay, "Replayer", lambda *_, **__: replayer)
+
+
+@pytest.mark.usefixtures("nothing_runs_again")
+@pytest.mark.parametrize("main", [explained, filmed, replayed])
 @pytest.mark.parametrize(
     ("change", "lost"),
     [(in_chunk, "some of the later records are missing"), (in_length, "the rest was not read"), (cut, "")],
 )
 def test_a_command_tells_of_damage_once(
-    main: Callable[[Path], int],
-    change: Change,
-    lost: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    main: Damaged, change: Change, lost: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    opened = SimpleNamespace(policy=None, language=None)
-    monkeypatch.setattr(replay, "open_proven", lambda _: opened)
-    replayer = SimpleNamespace(step=lambda _: None, comparison=None)
-    monkeypatch.setattr(replay, "Replayer", lambda *_, **__: replayer)
     log = write(tmp_path / "flight.mcap", change)
-    assert main(log) == EXIT_DONE
+    assert main(log, tmp_path / "result.json") == EXIT_DONE
     told = [line for line in capsys.readouterr().err.splitlines() if "damaged" in line]
     assert len(told) == (1 if lost else 0)
     assert all(f"{log}: damaged after 0.0 s (" in line and line.endswith(f"; {lost}") for line in told)
+
+
+@pytest.mark.usefixtures("nothing_runs_again")
+@pytest.mark.parametrize("main", [explained, replayed])
+@pytest.mark.parametrize(("change", "damaged"), [(in_chunk, True), (cut, False)])
+def test_a_result_names_the_damage_and_none_of_a_whole_log(
+    main: Damaged, change: Change, damaged: bool, tmp_path: Path
+) -> None:
+    log, out = write(tmp_path / "flight.mcap", change), tmp_path / "result.json"
+    main(log, out)
+    damage = json.loads(out.read_text())["damage"]
+    assert (f"{log}: damaged after 0.0 s" in damage) if damaged else damage is None
+
+
+def test_the_page_names_the_damage(tmp_path: Path) -> None:
+    log, page = write(tmp_path / "flight.mcap", in_chunk), tmp_path / "why.html"
+    assert explain_page.main([str(log), "--page", str(page)]) == EXIT_DONE
+    assert f"{log}: damaged after 0.0 s" in page.read_text()
 
 
 @pytest.mark.parametrize(
