@@ -83,8 +83,10 @@ def _listed(directory: Path, raw: bytes) -> dict[str, str]:
         raise ArtifactError(f"{path}: not JSON ({error})") from error
     if not isinstance(manifest, dict):
         raise ArtifactError(f"{path}: expected a JSON object")
-    files = manifest.get("files")
-    if manifest.get("schema_version") == SCHEMA_VERSION:
+    files, version = manifest.get("files"), manifest.get("schema_version")
+    if type(version) is not int or version < 1:
+        raise ArtifactError(f"{path}: schema version {version!r}, expected a whole number from 1 on; export again")
+    if version == SCHEMA_VERSION:
         files = parse_manifest(directory, raw)["files"]
         if not isinstance(files, dict):
             raise ArtifactError(f"{path}: files: expected a JSON object; export again")

@@ -79,7 +79,7 @@ def write_fake_artifacts(folder: Path, content: str, size: int = 100_000) -> Pat
     data = hashlib.sha256(content.encode()).digest() * (size // 32)
     (folder / "graph.onnx").write_bytes(data)
     (folder / "files.sha256").write_text(f"{hashlib.sha256(data).hexdigest()}  graph.onnx\n")
-    (folder / "manifest.json").write_text(json.dumps({"content": content}))
+    (folder / "manifest.json").write_text(json.dumps({"schema_version": 1, "content": content}))
     return folder
 
 

@@ -41,7 +41,11 @@ def versions(tmp_path: Path) -> Versions:
     for version in (1, 2, 3):
         _, artifacts = versions.sources(version)
         hashes = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in artifacts.glob("*.onnx")}
-        manifest = {"content": version, "files": {name: {"sha256": sha256} for name, sha256 in hashes.items()}}
+        manifest = {
+            "schema_version": 1,
+            "content": version,
+            "files": {name: {"sha256": sha256} for name, sha256 in hashes.items()},
+        }
         (artifacts / "manifest.json").write_text(json.dumps(manifest))
     assert versions.install(1) == versions.install(2) == EXIT_DONE
     return versions
@@ -125,8 +129,15 @@ def test_a_link_among_the_artifacts_is_refused_before_anything_is_copied(version
 
 @pytest.mark.parametrize(
     "text",
-    ["\0 not json", "[]", '{"files": {"graph.onnx": {"sha256": "0"}}}'],
-    ids=["no JSON", "no object", "another hash"],
+    [
+        "\0 not json",
+        "[]",
+        '{"schema_version": 1, "files": {"graph.onnx": {"sha256": "0"}}}',
+        "{}",
+        '{"schema_version": "1"}',
+        '{"schema_version": true}',
+    ],
+    ids=["no JSON", "no object", "another hash", "no version", "a text as version", "no number as version"],
 )
 def test_a_dry_run_refuses_a_damaged_manifest(versions: Versions, text: str) -> None:
     (versions.sources(3)[1] / "manifest.json").write_text(text)
