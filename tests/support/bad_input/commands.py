@@ -111,19 +111,16 @@ TABLE: Final = (
     _console(
         "edge-calib", "odometry", f"odometry {{folder}}/none.mcap --robot {ROBOT}",
         {0: choices, 1: other_files(".mcap"), "--json": outputs, "--out": outputs, "--robot": toml_files},
-        preload=("calib.odometry",),
     ),
     _console(
         "edge-calib", "latency", "latency --log {folder}/none.json --out {folder}/profile.json",
         {"--log": json_files, "--out": outputs, "--json": outputs, "--scale-to-mean": seconds, "--mode": choices,
          "--generations": numbers("-1", "0", "1.5"), "--seconds": seconds},
-        preload=("calib.latency",),
     ),
     _console(
         "edge-calib", "power", "power --artifacts {artifacts} --out {folder}/power.toml",
         {"--artifacts": directories, "--out": outputs, "--json": outputs, "--seconds": seconds,
          "--rounds": numbers("-1", "0", "1.5"), "--meter": choices},
-        preload=("calib.power",),
     ),
     _console(
         "edge-export", "", "--dry-run",
@@ -193,15 +190,13 @@ TABLE: Final = (
          "--cluster": texts("", "nope", "nope:1", ":1", "127.0.0.1:1", "127.0.0.1:99999", "127.0.0.1:-1",
          "\x1b[2J:1"),
          "--json": outputs, "--out": output_directories, "--video": choices}, says=("address",),
-        preload=("sim_hil.benchmark.run_command",),
+        notes=1,  # PyBullet's own, when it is loaded
     ),
     _console("edge-bench", "latency", "--suite dynanav --policy artifacts:{artifacts}",
-        {"--latency": numbers("-1", "1e9", "profile:", "profile:/nope", "profile:/dev/zero")},
-        preload=("sim_hil.benchmark.run_command",)),
+        {"--latency": numbers("-1", "1e9", "profile:", "profile:/nope", "profile:/dev/zero")}, notes=1),
     _console("edge-bench", "compare", "compare {folder}/a {folder}/b", {1: directories, "--json": outputs}),
     _console("edge-bench", "report", "report {folder}/a", {1: directories}),
-    _console("edge-bench", "validate", "validate", {"--suite": toml_files, "--json": outputs},
-        preload=("sim_hil.benchmark.suite.validate",)),
+    _console("edge-bench", "validate", "validate", {"--suite": toml_files, "--json": outputs}, notes=1),
     _console(
         "edge-soak", "", "--artifacts {artifacts} --duration 1m --out {folder}/soak",
         {"--artifacts": directories, "--duration": numbers("-1", "0", "1s", "1y"), "--faults": toml_files,
@@ -227,7 +222,7 @@ TABLE: Final = (
         {"--out": output_directories, "--drives": directories, "--from": directories,
          "--checkpoint": other_files(".safetensors"),
          "--device": texts("", "nope", "cuda:x", "cpu:1", "\x1b[2J"), "--after": texts("nope"),
-         "--json": outputs}, notes=2, preload=("torch._inductor.config",),  # what deterministic algorithms load
+         "--json": outputs}, notes=2,
     ),
     _console("edge-train", "card", "card --out {folder}/run", {"--out": directories, "--scores": json_files,
          "--ship": output_directories}, says=("train first", "folder of a run")),

@@ -15,7 +15,7 @@ from typing import Final
 from edge.signature import keygen
 from tests.support.bad_input.values import Bad, full_outputs
 
-LIMIT_S: Final = 10.0
+LIMIT_S: Final = 30.0
 CACHE: Final = ".cache/"
 LONGEST_LINE: Final = 2000
 Values = Callable[[Path], Iterator[Bad]]
@@ -35,7 +35,6 @@ class Command:
     bad: Mapping[str | int, Values]
     quick: str = ""
     function: str = "main"
-    preload: tuple[str, ...] = ()
     codes: tuple[int, ...] = (1, 2, 3)
     quick_notes: int = 0
     """Lines that the short run prints before its error."""
@@ -121,7 +120,7 @@ def run(command: Command, folder: Path, chosen: Sequence[Case]) -> list[Answer]:
             }
         )  # fmt: skip
     before = _listing(folder / "bad" / "outputs")
-    order = {"module": command.module, "function": command.function, "preload": command.preload, "cases": sent}
+    order = {"module": command.module, "function": command.function, "cases": sent}
     done = subprocess.run(
         [sys.executable, "-m", "tests.support.bad_input.server"],
         input=json.dumps(order), stdout=subprocess.PIPE, text=True, check=True,

@@ -1,4 +1,7 @@
-"""Runs cases of one command: imports it once, then forks for each case. Run as a program, cases on standard input."""
+"""Runs cases of one command: imports it once, then forks for each case. Run as a program, cases on standard input.
+
+What a case imports is imported here after it, so that the cases after it find it loaded.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +14,11 @@ import resource
 import selectors
 import signal
 import sys
+import tempfile
 import time
 import traceback
 from pathlib import Path
-from typing import Any, Final, NoReturn
+from typing import Any, Final, NoReturn, TextIO
 
 MEMORY_BYTES: Final = 6 << 30
 SMALL_FILE_BYTES: Final = 1
@@ -28,19 +32,22 @@ def main() -> None:
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # modules that print when they are loaded
     function = getattr(importlib.import_module(order["module"]), order["function"])
-    for module in order["preload"]:
-        importlib.import_module(module)
     for case in order["cases"]:
-        answers.write(json.dumps(_answer(function, case)) + "\n")
-        answers.flush()
+        with tempfile.TemporaryFile("w+", encoding="utf-8") as modules:
+            answers.write(json.dumps(_answer(function, case, modules)) + "\n")
+            answers.flush()
+            modules.seek(0)
+            for module in modules.read().split():
+                with contextlib.suppress(ImportError):  # not all of them are files
+                    importlib.import_module(module)
 
 
-def _answer(function: Any, case: dict[str, Any]) -> dict[str, Any]:
+def _answer(function: Any, case: dict[str, Any], modules: TextIO) -> dict[str, Any]:
     out, err = os.pipe(), os.pipe()
     started = time.monotonic()
     child = os.fork()
     if child == 0:
-        _be(function, case, out[1], err[1])
+        _be(function, case, out[1], err[1], modules)
     os.close(out[1])
     os.close(err[1])
     until = started + case["limit_s"]
@@ -76,8 +83,8 @@ def _read(out: int, err: int, until: float) -> tuple[list[str], bool]:
     return [text.decode("utf-8", "replace") for text in found.values()], hung
 
 
-def _be(function: Any, case: dict[str, Any], out: int, err: int) -> NoReturn:
-    code = 99
+def _be(function: Any, case: dict[str, Any], out: int, err: int, modules: TextIO) -> NoReturn:
+    code, loaded = 99, set(sys.modules)
     try:
         os.setsid()
         folder = Path(case["cwd"])
@@ -110,6 +117,8 @@ def _be(function: Any, case: dict[str, Any], out: int, err: int) -> NoReturn:
     finally:
         try:
             sys.stderr.flush()
+            if not case["small_files"]:
+                print(*(name for name in sys.modules if name not in loaded), file=modules, flush=True)
         finally:
             os._exit(code)
 
