@@ -190,13 +190,8 @@ def test_a_cached_export_is_byte_identical_even_if_the_first_was_changed(artifac
     subprocess.run(["diff", "-r", str(artifacts_dir), str(second)], check=True, timeout=60)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
-def test_an_interrupted_export_leaves_nothing_half_written_and_goes_on_where_it_was(
-    artifacts_dir: Path, tmp_path: Path, number: signal.Signals
-) -> None:
-    cache, out = tmp_path / "cache", tmp_path / "out" / "nano"
-    command = [sys.executable, "-m", "export.cli", *RANDOM, "--out", str(out), "--cache", str(cache)]
+def export_interrupted_by(number: signal.Signals, command: Sequence[str], stage: str) -> None:
+    """Start an export and send it a signal when it has begun a stage; it must end as an interrupted command does."""
     # A background job of a shell ignores SIGINT and so would its children; what is handled here is default there.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
@@ -206,7 +201,7 @@ def test_an_interrupted_export_leaves_nothing_half_written_and_goes_on_where_it_
     try:
         assert process.stderr is not None
         for line in process.stderr:
-            if "gate vision_encoder · " in line:
+            if f"{stage} · " in line:
                 break
         process.send_signal(number)
         assert process.wait(timeout=60) == 130
@@ -214,13 +209,24 @@ def test_an_interrupted_export_leaves_nothing_half_written_and_goes_on_where_it_
         process.kill()
         process.wait(timeout=60)
         process.stderr.close()
-    assert not any(out.parent.iterdir())
-    assert [path for path in cache.iterdir() if path.name.endswith(".partial")] == []
+
+
+@pytest.mark.slow
+def test_an_interrupted_export_leaves_nothing_half_written_and_goes_on_where_it_was(
+    artifacts_dir: Path, tmp_path: Path
+) -> None:
+    cache, out = tmp_path / "cache", tmp_path / "out" / "nano"
+    command = [sys.executable, "-m", "export.cli", *RANDOM, "--out", str(out), "--cache", str(cache)]
+    for number, stage in ((signal.SIGINT, "gate vision_encoder"), (signal.SIGTERM, "gate action_expert")):
+        export_interrupted_by(number, command, stage)
+        assert not any(out.parent.iterdir())
+        assert [path for path in cache.iterdir() if path.name.endswith(".partial")] == []
     done = subprocess.run(
         command, capture_output=True, text=True, timeout=120, cwd=Path(__file__).parents[3], check=True
     )
     assert "weights: from the cache" in done.stderr
     assert "graph action_expert: from the cache" in done.stderr
+    assert "gate vision_encoder: from the cache" in done.stderr
     assert done.stdout == ""
     subprocess.run(["diff", "-r", str(artifacts_dir), str(out)], check=True, timeout=60)
 

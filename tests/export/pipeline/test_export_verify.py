@@ -22,11 +22,13 @@ from edge.inference.self_test import SelfTestError
 from edge.inference.start_guard import Memory, StartGuard
 from export.cli import main
 from export.core.cache import file_sha256
+from export.model.network import build
+from export.model.weights import WeightsInfo, save_weights
 from export.pipeline import job
 from export.pipeline.self_test import recorded_and_expected_limits, self_test_limits
 from export.targets.file import TARGETS_DIR
 from tests.edge.inference.test_self_test import loop_for_ever
-from tests.support.export.export_job import manifest
+from tests.support.export.export_job import NANO, manifest
 
 
 @pytest.mark.slow
@@ -209,21 +211,32 @@ def test_verify_refuses_artifacts_of_other_weights(artifacts_dir: Path, capsys: 
     assert "other weights" in capsys.readouterr().err
 
 
+@pytest.fixture(scope="module")
+def of_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with weights, `nano.safetensors`, and artifacts of them, `nano`."""
+    folder = tmp_path_factory.mktemp("checkpoint")
+    saved = str(folder / "nano.safetensors")
+    assert main(["--out", str(folder / "first"), "--random-weights", "0", "--save-weights", saved]) == 0
+    assert main(["--out", str(folder / "nano"), "--checkpoint", saved]) == 0
+    return folder
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("shipped", "code", "message"), [(False, 2, "pass these weights with"), (True, 1, "other weights than")]
 )
-def test_verify_of_a_checkpoint_takes_the_checkpoint(
-    artifacts_dir: Path, tmp_path: Path, capsys: Any, monkeypatch: Any, shipped: bool, code: int, message: str
+def test_verify_of_a_checkpoint_asks_for_the_checkpoint(
+    of_checkpoint: Path, tmp_path: Path, capsys: Any, monkeypatch: Any, shipped: bool, code: int, message: str
 ) -> None:
-    saved, others, out = tmp_path / "nano.safetensors", tmp_path / "others.safetensors", tmp_path / "nano"
-    for seed, weights in ((0, saved), (1, others)):
-        where = str(tmp_path / f"first{seed}")
-        assert main(["--out", where, "--random-weights", str(seed), "--save-weights", str(weights)]) == 0
-    assert main(["--out", str(out), "--checkpoint", str(saved)]) == 0
-    capsys.readouterr()
+    others = tmp_path / "others.safetensors"
+    save_weights(build(NANO, 1), others, WeightsInfo(trained=False, origin="random seed 1"))
     monkeypatch.setattr(job, "shipped_weights", lambda config: others if shipped else None)
-    assert main(["verify", str(out)]) == code
+    assert main(["verify", str(of_checkpoint / "nano")]) == code
     error = capsys.readouterr().err
     assert message in error and "checkpoint" in error
-    assert main(["verify", str(out), "--checkpoint", str(saved)]) == 0
+
+
+@pytest.mark.slow
+def test_verify_of_a_checkpoint_takes_the_checkpoint(of_checkpoint: Path) -> None:
+    saved = str(of_checkpoint / "nano.safetensors")
+    assert main(["verify", str(of_checkpoint / "nano"), "--checkpoint", saved]) == 0
