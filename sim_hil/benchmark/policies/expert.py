@@ -56,7 +56,7 @@ class ExpertPolicy:
 
     def __init__(
         self, *, margin_m: float = 0.0, speed_mps: float | None = None, prescribed: Sequence[Vec2] = (),
-        patient: bool = False, rests: bool = False, wall_m: float = 0.0,
+        patient: bool = False, rests: bool = False, wall_m: float = 0.0, about_left: bool = False,
     ) -> None:  # fmt: skip
         """Create the benchmark's expert; a teacher sets further options.
 
@@ -64,9 +64,10 @@ class ExpertPolicy:
         comfortable speed. `prescribed`: the route of the student's instruction, points in m, followed even if another
         one is shorter. `patient`: keep the distance to people even after standing for long, because it is the student
         that stands. `rests`: stand at the route's end; in the benchmark the episode is over by then. `wall_m`: width
-        added to each side of the robot where there is room, because a student drives less exactly.
+        added to each side of the robot where there is room, because a student drives less exactly. `about_left`: turn
+        about to the left only (see `Motion`).
         """
-        self._rests, self._wall_m = rests, wall_m
+        self._rests, self._wall_m, self._about_left = rests, wall_m, about_left
         self._patient = patient
         self._prescribed = prescribed
         self._margin_m = margin_m
@@ -77,8 +78,9 @@ class ExpertPolicy:
     def alike(self) -> ExpertPolicy:
         """Return a new expert with the same options, without a prescribed route."""
         return ExpertPolicy(
-            margin_m=self._margin_m, speed_mps=self._speed_mps, patient=self._patient, wall_m=self._wall_m
-        )
+            margin_m=self._margin_m, speed_mps=self._speed_mps, patient=self._patient, wall_m=self._wall_m,
+            about_left=self._about_left,
+        )  # fmt: skip
 
     def reset(self, episode: Episode, instruction: str, world: EpisodeWorld | None, seed: int) -> None:
         """Plan the episode. Raises ValueError without a world or if the goal cannot be reached."""
@@ -100,7 +102,7 @@ class ExpertPolicy:
             speed_mps=speed_mps,
             body_radius_m=driving.body_radius_m + self._wall_m,
         )
-        self._motion = Motion(planner.grid, self._driving)
+        self._motion = Motion(planner.grid, self._driving, about_left=self._about_left)
         self._route = np.array([(pose.x_m, pose.y_m)])
         self._ticks = 0
         self._choice = None

@@ -8,12 +8,13 @@ the command. The method combines Fox's dynamic window with van den Berg's veloci
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import exp
+from math import atan2, exp, pi
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.core.geometry import wrap_angle
 from sim_hil.benchmark.policies.expert_route import SPACING_M
 from sim_hil.crowd.people import PERSON_RADIUS_M
 from sim_hil.scene.nav_grid import NavGrid
@@ -28,6 +29,10 @@ _SIDES: Final = np.array(_SHIFTS_M)
 _PACES: Final = (1.0, 0.75, 0.5, 0.25)
 # Candidates that do not follow the route: share of the top speed, share of the top turning rate.
 _FIXED: Final = ((0.0, 0.0), (0.0, 0.7), (0.0, -0.7), (-0.25, 0.0), (-0.25, 0.4), (-0.25, -0.4))
+_AIM_M, _AIM_S = 0.45, 0.45  # the robot aims at the route this far ahead, and this long at its speed
+
+ABOUT_RAD: Final = 2.0
+"""Bearing of the route beyond which a robot turns about."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +73,9 @@ class Choice:
 class Motion:
     """Local planner that chooses a velocity every CONTROL_S and keeps the last one for smoothness."""
 
-    def __init__(self, grid: NavGrid, driving: Driving) -> None:
+    def __init__(self, grid: NavGrid, driving: Driving, *, about_left: bool = False) -> None:
+        """`about_left`: turn about to the left, also where the right is nearer: a student cannot see which one is."""
+        self._about_left = about_left
         self._grid = grid
         self._driving = driving
         self._speed, self._turn, self._shift = 0.0, 0.0, 0.0
@@ -102,8 +109,11 @@ class Motion:
         """
         # If something blocks the robot, its real speed differs from the commanded one: stay close to the measurement.
         self._speed = min(max(self._speed, speed_mps - 0.35), speed_mps + 0.35)
-        x, y, v, turned, wanted_v, wanted_w = self._drive(pose, route)
+        about = self._about_left and abs(self._bearing_rad(pose, route)) > ABOUT_RAD
+        x, y, v, turned, wanted_v, wanted_w = self._drive(pose, route, about=about)
         cost = self._progress(x, y, route) + self._walls(x, y, turned)
+        if about:
+            cost[0] -= 1.0  # it turns to the route itself, unless a wall or a person is near: no progress pays for that
         if len(people):
             cost = cost + self._people(x, y, v, turned, people, velocities, patience)
         cost = cost + 0.06 * np.abs(wanted_v - self._speed) + 0.03 * np.abs(wanted_w - self._turn)
@@ -131,7 +141,15 @@ class Motion:
         self._shift = 0.0
         return Choice(self._speed, self._turn, np.array(pose[:2]) + np.cumsum(ways, axis=0), headings, 0.0, 0.0)
 
-    def _drive(self, pose: tuple[float, float, float], route: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
+    def _bearing_rad(self, pose: tuple[float, float, float], route: Array) -> float:
+        """Return the bearing of the point of the route that the robot aims at."""
+        nearest = int(np.argmin(np.hypot(route[:15, 0] - pose[0], route[:15, 1] - pose[1])))
+        x, y = route[min(nearest + int((_AIM_M + _AIM_S * abs(self._speed)) / SPACING_M), len(route) - 1)]
+        return wrap_angle(atan2(y - pose[1], x - pose[0]) - pose[2])
+
+    def _drive(
+        self, pose: tuple[float, float, float], route: Array, *, about: bool
+    ) -> tuple[Array, Array, Array, Array, Array, Array]:
         """Simulate all candidates: x, y, v, heading [STEPS, candidates], and the first commanded v and w of each."""
         driving, count = self._driving, len(self._pace)
         line, left = _line_and_left(route)
@@ -150,12 +168,15 @@ class Motion:
         first: tuple[Array, Array] = (v, w)
         top, turn_step = driving.turn_radps, driving.turn_accel_radps2 * STEP_S
         brake, accel = driving.brake_mps2 * STEP_S, driving.accel_mps2 * STEP_S
+        leftwards = np.full(count, about)
         for step in range(STEPS):
-            ahead = ((along + 0.45 + 0.45 * np.abs(v)) * (1.0 / SPACING_M)).astype(np.int64)
+            ahead = ((along + _AIM_M + _AIM_S * np.abs(v)) * (1.0 / SPACING_M)).astype(np.int64)
             at = row + np.minimum(ahead, last)
             dx, dy = aims_x[at] - x, aims_y[at] - y
             fore, side = c * dx + s * dy, c * dy - s * dx
             error = np.arctan2(side, fore)
+            error = np.where(leftwards & (error < 0.0), error + 2 * pi, error)
+            leftwards &= error > pi / 2
             aimed = np.maximum(fore, 0.0) / np.maximum(np.sqrt(fore * fore + side * side), 1e-6)
             want_v = np.where(self._is_fixed, self._fixed_v, self._pace * aimed * aimed)
             turning = np.minimum(np.maximum(1.8 * error, -top), top)

@@ -189,6 +189,7 @@ def _drive(order: Order, number: int, scenario: Scenario) -> Entry:
         patient=plan.policy_drives or detour is not None,
         rests=True,
         wall_m=config.wall_m,
+        about_left=True,
     )
     if order.policy is not None:
         with PolicyDriver(order.policy, episode, rng) as policy:

@@ -30,6 +30,7 @@ from sim_hil.benchmark.language.openings import Frame, Opening, bounds_of
 from sim_hil.benchmark.language.route import Step
 from sim_hil.benchmark.language.task_checks import MIN_PIXELS, RANGE_INDOORS_M, RANGE_OUTDOORS_M
 from sim_hil.benchmark.language.visibility import EYE_M, HFOV_RAD
+from sim_hil.benchmark.policies.expert_motion import ABOUT_RAD
 from sim_hil.scene.scene import SceneObject, Vec2, Vec3
 from sim_hil.simulation.camera import MOUNTS
 from tools.train.drives.progress_labels import RouteProgress
@@ -59,7 +60,6 @@ _INSIDE_M: Final = 0.2  # depth inside an opening of the point whose visibility 
 _BACK_M: Final = -0.3  # a planned x in 3 s below this counts as turning back
 _ASIDE_RAD: Final = radians(60.0)  # off the route, so does a planned bearing beyond this that no near turn explains
 _NEAR_TURN_M: Final = 3.0  # largest distance of a turn that explains it
-_ROUND_RAD: Final = 2.0  # the expert usually turns around for targets beyond this bearing
 _AGAINST: Final = -0.5  # cosine between a heading and a leg's direction below which the robot drives the leg backwards
 _BESIDE_M: Final = 1.0  # up to this walking distance to the route, the robot drives beside it and is not off it
 _HERE_M: Final = 0.05  # a planned position within this distance means staying
@@ -75,7 +75,7 @@ def turning_first(point: Vec2, turn_radps: float, speed_mps: float) -> Vec2:
     bearing, gap_m = atan2(point[1], point[0]), hypot(*point)
     if gap_m < _HERE_M:
         return (_ON_M, 0.0)  # it stays, without waiting for a person
-    if abs(bearing) > _ROUND_RAD:
+    if abs(bearing) > ABOUT_RAD:
         return (2.0 * _BACK_M, 0.0)
     gone_m = max(3.0 - abs(bearing) / turn_radps, 0.0) * speed_mps
     return gone_m * cos(bearing), gone_m * sin(bearing)

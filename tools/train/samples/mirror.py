@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from edge.core.geometry import SE2
 from edge.state.reasoning_text import Plan, ReasoningText, Turn, Waypoints
+from sim_hil.benchmark.policies.expert_motion import ABOUT_RAD
 from tools.train.config.collect import TRACE_EVERY
 from tools.train.drives.drive import Dataset, Drive
 from tools.train.drives.trace_sentences import aspects_json, aspects_of_json
@@ -188,8 +189,12 @@ class MirroredDrives(Dataset):
 
 
 def mirrored_frames(drive: DriveFrames) -> DriveFrames:
-    """Mark a drive's frames as mirrored and restrict them to whole seconds, at which mirrored images have tokens."""
-    weight = np.where(np.arange(len(drive)) % TRACE_EVERY == 0, drive.weight, 0.0)
+    """Mark a drive's frames as mirrored and restrict them to whole seconds, at which mirrored images have tokens.
+
+    Frames that turn about are left out: the expert turns about to the left, their mirror images to the right.
+    """
+    about = drive.target[:, :, 2].min(axis=1) < -ABOUT_RAD
+    weight = np.where((np.arange(len(drive)) % TRACE_EVERY == 0) & ~about, drive.weight, 0.0)
     return replace(drive, in_mirror=True, weight=weight)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from math import hypot
+from math import cos, hypot, radians, sin
 
 import numpy as np
 import pytest
@@ -105,6 +105,33 @@ def test_a_goal_without_a_way_to_it_is_refused() -> None:
         pytest.raises(ValueError, match="no path"),
     ):
         ExpertPolicy().reset(episode, "Go.", world, 0)
+
+
+def _turned_deg(route_deg: float, *, about_left: bool) -> float:
+    """Return the largest rotation, degrees, of a robot in a hall whose route leads straight away at a bearing."""
+    motion = Motion(ground(hall()).grid, Driving(), about_left=about_left)
+    route = np.outer(np.arange(0.0, 6.0, SPACING_M), (cos(radians(route_deg)), sin(radians(route_deg))))
+    at, heading, speed, turned = np.zeros(2), 0.0, 0.0, [0.0]
+    while np.hypot(*at) < 1.0 and len(turned) < 100:
+        nearest = int(np.argmin(np.hypot(*(route - at).T)))
+        choice = motion.choose((*at, heading), speed, route[nearest:], NOBODY, NOBODY)
+        heading, speed = heading + 0.1 * choice.wz_radps, choice.vx_mps
+        at = at + 0.1 * speed * np.array((cos(heading), sin(heading)))
+        turned.append(np.degrees(heading))
+    return max(turned, key=abs)
+
+
+@pytest.mark.parametrize("route_deg", [-175.0, -150.0, -120.0, 120.0, 175.0])
+def test_a_teacher_turns_about_to_the_left_whichever_side_is_nearer(route_deg: float) -> None:
+    assert _turned_deg(route_deg, about_left=True) > 100.0
+
+
+def test_it_turns_to_the_right_up_to_there() -> None:
+    assert _turned_deg(-100.0, about_left=True) < -80.0
+
+
+def test_the_benchmarks_expert_turns_to_the_nearer_side() -> None:
+    assert _turned_deg(-150.0, about_left=False) < -100.0
 
 
 def ground(scene: Scene, clearance_m: float = 0.33, max_step_m: float = 0.06) -> PlannerGround:

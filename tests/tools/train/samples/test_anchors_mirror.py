@@ -123,6 +123,15 @@ def test_motion_and_labels_go_to_the_other_side() -> None:
     assert moved.as_tuple() == pytest.approx(SE2(true.x_m, -true.y_m, -true.theta_rad).as_tuple())
 
 
+@pytest.mark.parametrize(("turn_rad", "is_drawn"), [(1.9, True), (2.5, False), (-2.5, True)])
+def test_a_turn_about_to_the_left_has_no_mirror_image(turn_rad: float, is_drawn: bool) -> None:
+    drive = made_up_drive("about")
+    future = np.zeros_like(drive.future)
+    future[20, :, 2] = np.linspace(0.0, turn_rad, future.shape[1])
+    frames = DriveFrames.of(mirrored_drive(dataclasses.replace(drive, future=future)), 50, EVEN.weights)
+    assert (mirrored_frames(frames).weight[20] > 0) == is_drawn
+
+
 class MirroredSeconds:
     """Tokens of 13 seconds; the first number says which."""
 
