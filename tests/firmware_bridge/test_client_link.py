@@ -281,6 +281,24 @@ class TestListening:
             link.close()
             assert client.recv(1) == b""
 
+    @pytest.mark.parametrize("is_replaced", [False, True])
+    def test_a_socket_without_its_file_knows_it_and_leaves_anothers(self, path: Path, is_replaced: bool) -> None:
+        with closing(ClientLink(path)) as link:
+            assert not link.is_removed
+            path.unlink()
+            if is_replaced:
+                path.write_text("another's")
+            assert link.is_removed
+        assert path.exists() == is_replaced
+
+    def test_a_file_that_goes_while_the_socket_closes_is_no_error(
+        self, path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        link = ClientLink(path)
+        path.unlink()
+        monkeypatch.setattr(ClientLink, "is_removed", False)
+        link.close()
+
 
 class TestGroups:
     def test_one_group_for_runner_and_operators_is_refused(self) -> None:
