@@ -8,8 +8,6 @@ import time
 from dataclasses import replace
 from typing import Final
 
-import pybullet
-
 from edge.core.cli import (
     EXIT_BAD_INPUT,
     EXIT_CHECK_FAILED,
@@ -31,6 +29,7 @@ from sim_hil.hil.trace import TraceWriter
 from sim_hil.hil.view import HilView
 from sim_hil.protocols.front_end import FrontEndError, FrontEndOptions
 from sim_hil.protocols.registry import open_front_end
+from sim_hil.robots.bullet import pybullet
 from sim_hil.scene.scene import Scene, SceneError
 from sim_hil.simulation.physics import Simulation
 

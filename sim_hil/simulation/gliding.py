@@ -14,8 +14,8 @@ from types import MappingProxyType
 from typing import Final
 
 import numpy as np
-import pybullet
 
+from sim_hil.robots.bullet import pybullet
 from sim_hil.robots.carter import drive as carter_drive
 from sim_hil.robots.carter.urdf import RADIUS_M as CARTER_RADIUS_M
 from sim_hil.robots.go2 import body as go2

@@ -13,10 +13,10 @@ from types import MappingProxyType
 from typing import Final, cast
 
 import numpy as np
-import pybullet
 from numpy.typing import NDArray
 
 from sim_hil.crowd.people import PERSON_HEIGHT_M, PERSON_RADIUS_M, RENDER_FIELDS, UPDATE_HZ, People, appearances
+from sim_hil.robots.bullet import pybullet
 from sim_hil.robots.go2.body import Go2, RobotTruth
 from sim_hil.robots.go2.gait import GRAVITY_MPS2
 from sim_hil.robots.go2.sport import SportAction

@@ -23,7 +23,6 @@ GRACE_S: Final = 2.0
 SILENT_S: Final = 3600.0
 """Time without a message after which a worker counts as hung and is killed, s."""
 _TAIL_CHARS: Final = 400
-_GREETING: Final = "pybullet build time"  # printed by every process that loads the engine
 _EXIT_POLL_S: Final = 0.05
 _POLL_S: Final = 0.5
 
@@ -156,5 +155,5 @@ class Workers:
 
 
 def _last_line(log: Path) -> str:
-    lines = [line.strip() for line in last_lines(log) if not line.startswith(_GREETING)]
+    lines = [line.strip() for line in last_lines(log)]
     return f": {lines[-1][-_TAIL_CHARS:]}" if lines else ""

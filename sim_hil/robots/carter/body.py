@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import pybullet
 from numpy.typing import NDArray
 
 from sim_hil.robots.battery import BatteryReading
+from sim_hil.robots.bullet import pybullet
 from sim_hil.robots.carter.battery import CarterBattery, load_w
 from sim_hil.robots.carter.drive import DriveController, OdometrySample, WheelCalibration, WheelOdometry
 from sim_hil.robots.carter.urdf import BODY_COM_M, LINKS, RADIUS_M, write_carter_urdf

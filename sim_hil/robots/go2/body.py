@@ -7,9 +7,9 @@ from math import atan2, exp, pi, sqrt
 from pathlib import Path
 
 import numpy as np
-import pybullet
 from numpy.typing import NDArray
 
+from sim_hil.robots.bullet import pybullet
 from sim_hil.robots.go2.gait import GRAVITY_MPS2, BodyMotion
 from sim_hil.robots.go2.kinematics import Vec3, foot_position, foot_velocity
 from sim_hil.robots.go2.sport import LYING_RAD, Measured, SportAction, SportController

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-import pybullet
 
+from sim_hil.robots.bullet import pybullet
 from sim_hil.world.drawing.mesh import MeshBuilder, Surface
 from sim_hil.world.drawing.textures import png_bytes
 

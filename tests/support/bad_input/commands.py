@@ -190,13 +190,12 @@ TABLE: Final = (
          "--cluster": texts("", "nope", "nope:1", ":1", "127.0.0.1:1", "127.0.0.1:99999", "127.0.0.1:-1",
          "\x1b[2J:1"),
          "--json": outputs, "--out": output_directories, "--video": choices}, says=("address",),
-        notes=1,  # PyBullet's own, when it is loaded
     ),
     _console("edge-bench", "latency", "--suite dynanav --policy artifacts:{artifacts}",
-        {"--latency": numbers("-1", "1e9", "profile:", "profile:/nope", "profile:/dev/zero")}, notes=1),
+        {"--latency": numbers("-1", "1e9", "profile:", "profile:/nope", "profile:/dev/zero")}),
     _console("edge-bench", "compare", "compare {folder}/a {folder}/b", {1: directories, "--json": outputs}),
     _console("edge-bench", "report", "report {folder}/a", {1: directories}),
-    _console("edge-bench", "validate", "validate", {"--suite": toml_files, "--json": outputs}, notes=1),
+    _console("edge-bench", "validate", "validate", {"--suite": toml_files, "--json": outputs}),
     _console(
         "edge-soak", "", "--artifacts {artifacts} --duration 1m --out {folder}/soak",
         {"--artifacts": directories, "--duration": numbers("-1", "0", "1s", "1y"), "--faults": toml_files,

@@ -11,8 +11,8 @@ from types import TracebackType
 from typing import Final
 
 import numpy as np
-import pybullet
 
+from sim_hil.robots.bullet import pybullet
 from sim_hil.robots.go2.body import Go2
 from sim_hil.robots.go2.gait import GRAVITY_MPS2, GaitConfig
 from sim_hil.robots.go2.sport import MODE_DAMPING

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-import pybullet
-
+from sim_hil.robots.bullet import pybullet
 from sim_hil.robots.carter.body import Carter, CarterTruth
 from sim_hil.robots.carter.drive import WheelCalibration
 from tools.bench.sim.locomotion_runs import Vec3, add_box, open_physics
