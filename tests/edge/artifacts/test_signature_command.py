@@ -115,6 +115,12 @@ def test_a_result_replaces_no_key_and_no_artifact(
     assert {path.name: path.read_bytes() for path in key.parent.iterdir() if path.is_file()} == before
 
 
+def test_a_result_is_written_beside_the_artifacts(copy: Path, key: Path, tmp_path: Path) -> None:
+    result = tmp_path / "result.json"
+    assert main(["sign", str(copy), "--key", str(key), "--release", "1", "--json", str(result)]) == 0
+    assert json.loads(result.read_text())["release"] == 1
+
+
 @pytest.mark.parametrize(
     ("command", "shown"),
     [

@@ -36,7 +36,7 @@ velocities = st.builds(Velocity, u64, i64, f64, f64, f64)
 reasons = st.text(max_size=90)
 statuses = st.builds(
     BridgeStatus, i64, st.sampled_from(STATES), reasons, u64, u64, u64, st.tuples(f64, f64, f64), st.booleans(),
-    st.sampled_from(CAUSES), st.sampled_from(CAUSES), st.sampled_from(PERMITS), st.sampled_from(MOTIONS), f64,
+    st.sampled_from(CAUSES), st.sampled_from(CAUSES), st.sampled_from(PERMITS), st.sampled_from(MOTIONS), f64, u64,
 )  # fmt: skip
 i32 = st.integers(-(2**31), 2**31 - 1)
 states = st.builds(
@@ -49,6 +49,10 @@ messages = st.one_of(st.just(Arm()), st.just(Stop()), st.just(Release()), veloci
 @given(messages)
 def test_decoding_is_the_inverse_of_encoding(message: Message) -> None:
     assert decode(encode(message)) == message
+
+
+def test_a_status_without_a_robot_names_none() -> None:
+    assert BridgeStatus(1, "armed", "", 0, 0, 0, (0.0, 0.0, 0.0), zero_after_stop=False).robot == 0
 
 
 @given(statuses, st.text(min_size=300, max_size=600))
