@@ -211,8 +211,10 @@ def test_a_link_to_standard_output_is_written_after_what_is_there(tmp_path: Path
 
 @pytest.mark.parametrize(
     "arguments",
-    [("tools.bench.governor", "--seconds", "61"), ("firmware_bridge.bridge", "status", "--robot", str(ROBOT))],
-    ids=["tool", "edge-bridge"],
+    [
+        pytest.param(("tools.bench.governor", "--seconds", "61"), marks=pytest.mark.slow, id="tool"),
+        pytest.param(("firmware_bridge.bridge", "status", "--robot", str(ROBOT)), id="edge-bridge"),
+    ],
 )
 def test_standard_output_on_a_full_disk_is_one_line_and_exit_code_1(arguments: tuple[str, ...]) -> None:
     with Path("/dev/full").open("wb") as full:  # opened to be written to, never to be replaced

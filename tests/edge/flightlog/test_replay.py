@@ -332,6 +332,7 @@ def test_a_part_of_the_log_is_replayed_with_the_generation_that_it_drove_by(log:
     assert result["generations"]["compared"] == 1
 
 
+@pytest.mark.slow
 def test_nothing_to_compare_is_no_success(log: Log) -> None:
     code, result = log.replay("--from", "100")
     assert code == 1 and "no tick" in result["beyond"][0]

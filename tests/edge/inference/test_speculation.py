@@ -310,16 +310,16 @@ def test_guesses_change_no_bit_of_tokens_keys_and_values(request: pytest.Fixture
         ids_of(guessing, FIRST_TEXT), dict.fromkeys(guessing.rows, 1.0), guessing.ends_line, lambda _: False
     )
     rng, accepted = np.random.default_rng(0), 0
-    for seed in range(12):
+    for seed in range(6):
         expected = generated(plain, seed)
         # Guesses from right to wrong: the text itself with more and more other tokens.
         ids = np.array(expected.token_ids)
-        other = rng.random(len(ids)) < seed / 12
+        other = rng.random(len(ids)) < seed / 6
         guessing.speculator.end(np.where(other, rng.integers(1, 900, len(ids)), ids).tolist())
         found = generated(guessing, seed)
         assert_equal(found, expected)
         accepted += found.accepted
-    assert accepted > 100
+    assert accepted > 50
 
 
 def test_a_graph_that_rounds_rows_together_is_never_given_guesses(dynamic: Artifacts) -> None:

@@ -77,6 +77,7 @@ def test_the_camera_corrects_a_wrong_scale() -> None:
     assert errors[1] < 0.3 * errors[0]
 
 
+@pytest.mark.slow
 def test_minutes_of_a_noisy_camera_leave_the_scale_as_it_is() -> None:
     """The camera's noise once raised both scales for ever: in 90 minutes of a soak the fused path shrank by 39 %."""
     path, estimator = drive(300, vx_mps=0.1), DriftEstimator()

@@ -99,12 +99,12 @@ def test_a_base_without_an_imu_needs_none(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("share", [0.982, 1.018])
 def test_a_base_whose_cycle_is_not_quite_that_of_the_dbc_file_is_neither_early_nor_late(share: float) -> None:
-    """For 80 s: a count of the file's cycle would be 1.4 s off at the end."""
+    """For 20 s: a count of the file's cycle would be 0.36 s off at the end."""
     config, cycle_ns = load_robot_config(EXAMPLE), round(share * 10 * MS)
     assert config.can is not None
     can = replace(config.can, imu=None)
-    found = reports(can, load_database(replace(config, can=can)), [None] * 8000, cycle_ns)
+    found = reports(can, load_database(replace(config, can=can)), [None] * 2000, cycle_ns)
     ages_ns = [
         cycle * cycle_ns - report.state.robot_stamp_ns for cycle, report in enumerate(found) if report.state is not None
     ]
-    assert len(ages_ns) > 7900 and max(ages_ns) - min(ages_ns) < 50 * MS
+    assert len(ages_ns) > 1900 and max(ages_ns) - min(ages_ns) < 50 * MS
