@@ -155,5 +155,5 @@ class Workers:
 
 
 def _last_line(log: Path) -> str:
-    lines = [line.strip() for line in last_lines(log)]
-    return f": {lines[-1][-_TAIL_CHARS:]}" if lines else ""
+    lines = last_lines(log)
+    return f": {lines[-1].strip()[-_TAIL_CHARS:]}" if lines else ""
