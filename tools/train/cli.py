@@ -152,6 +152,9 @@ def _train(
 def _prepare(args: argparse.Namespace, recipe: Recipe, before: Sequence[Step]) -> None:
     """Write what a run needs before its first step: recipe, delay profile, given drives and given weights."""
     run_dir = RunDir.open(args.out, recipe)
+    if run_dir.other_code():
+        changed = f"{args.out}: was started with other code (versions.json); new drives may differ from its old ones"
+        _log(SINGLE, f"{changed}; name another --out to record all of them anew")
     if args.delay_profile is not None:
         write_whole(*own_profile(args))
     if args.base is not None:

@@ -49,12 +49,14 @@ def test_a_run_that_continues_with_other_code_reports_it_once(tmp_path: Path, mo
     first = json.loads((made.out / "versions.json").read_text())
     run_dir(tmp_path)
     assert json.loads((made.out / "versions.json").read_text()) == first
+    assert not made.other_code()
     monkeypatch.setattr("tools.train.run.run_dir.code_sha256", lambda: "of tomorrow")
     for _ in range(2):
         run_dir(tmp_path)
     versions = json.loads((made.out / "versions.json").read_text())
     later = versions.pop("later")
     assert versions == first and [each["code_sha256"]["simulation"] for each in later] == ["of tomorrow"]
+    assert made.other_code()
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "[]", "{", "\udcff"], ids=["deep", "list", "cut", "not UTF-8"])
