@@ -74,7 +74,7 @@ class RunDir:
     def other_code(self) -> bool:
         """Return whether the run began with other code than this: what it records from now on may differ."""
         first = read_record(self.out / VERSIONS)
-        return first.get("code_sha256") != versions()["code_sha256"]
+        return bool(first.get("code_sha256") != versions()["code_sha256"])
 
     def _changed(self, recipe: Recipe) -> str:
         """Return the first value of a started stage that differs from the recipe's; empty if none does."""
