@@ -26,7 +26,7 @@ IGNORED = -100
 PLAIN_TOKENS = 512
 """Longest rows, tokens, with plain attention on a CPU; its memory is quadratic in the length."""
 EVEN = 8
-"""Rows are padded to a multiple of this, tokens: other lengths take a CPU up to twice the time in attention."""
+"""Rows are padded to a multiple of this, tokens: a CPU multiplies 191 of them in twice the time of 192."""
 POOL = 32
 """Batches that are sorted by length together: a compromise between little padding and random order."""
 
