@@ -31,7 +31,7 @@ from sim_hil.scene.scene import SceneError
 from sim_hil.soak.arguments import UNTRAINED_MPS, check, parser
 from sim_hil.soak.faults import DEFAULT_MENU, SoakInputError, load_menu
 from sim_hil.soak.report import write_report
-from sim_hil.soak.run import SoakFolder, SoakOptions, lost_budget, run_legs, soak_result
+from sim_hil.soak.run import SoakFolder, SoakOptions, journey_of_leg, lost_budget, run_legs, soak_result
 from sim_hil.soak.verdict import DEFAULT_BUDGET, PASS, UNDECIDED, applicable, load_budget
 
 STATUS_PERIOD_S: Final = 30.0
@@ -117,7 +117,7 @@ def options_of(args: argparse.Namespace) -> SoakOptions:
     limit_mps = args.speed_limit
     if limit_mps is None and not artifacts.trained:
         limit_mps = UNTRAINED_MPS
-    return SoakOptions(
+    options = SoakOptions(
         artifacts=args.artifacts.absolute(),
         manifest_sha256=artifacts.manifest_sha256,
         trained=artifacts.trained,
@@ -135,6 +135,10 @@ def options_of(args: argparse.Namespace) -> SoakOptions:
         robot=args.robot,
         faults=args.faults,
     )
+    for scene in dict.fromkeys(scenes):
+        # Refused now, not hours later when its leg begins.
+        journey_of_leg(options, scene, 1).begin()
+    return options
 
 
 def summary_lines(result: Mapping[str, Any]) -> str:

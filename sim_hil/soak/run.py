@@ -152,6 +152,12 @@ def _check_disk_space(path: Path) -> None:
         raise SoakInputError(f"--out {path}: {refusal}")
 
 
+def journey_of_leg(options: SoakOptions, scene: str, number: int) -> Journey:
+    """Return the sequence of a leg's tasks. Raises ValueError for a scene without free space or landmarks."""
+    body = ROBOTS[options.robot].hil_robot
+    return Journey(load_scene(scene), options.seed, number, options.speed_mps, body, options.people)
+
+
 def run_legs(
     soak: SoakFolder,
     options: SoakOptions,
@@ -180,8 +186,7 @@ def run_legs(
         folder = soak.folder(number)
         folder.mkdir(parents=True, exist_ok=True)
         scene = options.scenes[(number - 1) % len(options.scenes)]
-        body = ROBOTS[options.robot].hil_robot
-        journey = Journey(load_scene(scene), options.seed, number, options.speed_mps, body, options.people)
+        journey = journey_of_leg(options, scene, number)
         stack = _stack_options(options, number, folder, scene, journey.begin(), faults=menu is not None)
         leg_options = LegOptions(number, options.seed, min(options.leg_s, left_s), options.speed_mps, stack)
         leg = Leg(leg_options, journey, menu, stopped=stopped, show_status=show_status)

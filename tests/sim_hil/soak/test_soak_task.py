@@ -8,12 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from edge.core.cli import EXIT_BAD_INPUT
 from edge.reasoning.told_turn import split_turn
 from sim_hil.benchmark.language.instruction_words import AROUND
 from sim_hil.benchmark.suite.robots import footprint_m, robot_grid
 from sim_hil.realtime.truth import TruePose, TruthTail
 from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.scene.scene import Scene, load_scene
+from sim_hil.soak.cli import main
 from sim_hil.soak.tasks import LENGTH_M, Journey, SoakTask, TaskRun
 
 S = 1_000_000_000
@@ -22,6 +24,16 @@ S = 1_000_000_000
 @pytest.fixture(scope="module")
 def office() -> Scene:
     return load_scene("office")
+
+
+def test_a_scene_without_a_reachable_task_is_refused_before_the_first_leg(
+    artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "soak"
+    scenes = ["--scene", "office", "--scene", "corridor"]
+    assert main(["--artifacts", str(artifacts_dir), "--duration", "10m", *scenes, "--out", str(out)]) == EXIT_BAD_INPUT
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "scene corridor: no task found in 24 tries" in line and not out.exists()
 
 
 @pytest.mark.slow
