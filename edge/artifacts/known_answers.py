@@ -12,7 +12,11 @@ from edge.artifacts.files import MANIFEST_NAME, ArtifactError
 CHAIN: Final = "chain"
 """Name of the answer of the whole chain: picture and instruction in, trajectory out."""
 VOCABULARY: Final = "vocabulary"
-"""Name of the language model's answer to every token of its vocabulary; manifests of earlier exports have none."""
+"""Name of the language model's answer to every token of its vocabulary."""
+LOGITS: Final = "logits"
+"""Name of what the language model thinks of every token as the next one."""
+LATER: Final = frozenset({VOCABULARY, LOGITS})
+"""Answers that manifests of earlier exports do not have."""
 SUMS: Final = 16
 """Numbers in a digest."""
 MAX_TOLERANCE: Final = 0.2
@@ -56,7 +60,7 @@ class KnownAnswers:
     same_tokens: float
     """Smallest share of the next tokens that must be the same."""
     answers: Mapping[str, Answer]
-    """By graph, in the order in which they are computed, CHAIN and VOCABULARY."""
+    """By graph, in the order in which they are computed, CHAIN and those of LATER."""
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON form."""
@@ -71,7 +75,7 @@ def read_known_answers(section: Any, graphs: Iterable[str]) -> KnownAnswers | No
         if not isinstance(section, dict) or set(section) != set(KnownAnswers.__dataclass_fields__):
             raise ArtifactError(f"expected {', '.join(KnownAnswers.__dataclass_fields__)}")
         answers = {str(name): _answer(str(name), entry) for name, entry in section["answers"].items()}
-        if {*answers, VOCABULARY} != {*graphs, CHAIN, VOCABULARY}:
+        if {*answers, *LATER} != {*graphs, CHAIN, *LATER}:
             raise ArtifactError(f"answers of {sorted(answers)}, expected one of every graph and of the {CHAIN}")
         known = KnownAnswers(
             seed=int(section["seed"]),

@@ -1,4 +1,4 @@
-"""Checks a tokenizer.json before the `tokenizers` library opens it: no part may expand a text, loop or panic.
+"""Checks a tokenizer.json, then opens it with the `tokenizers` library: no part may expand a text, loop or panic.
 
 The library runs what the file describes: a normalizer that replaces one letter by a million, padding to 10⁹ tokens, a
 regular expression that backtracks for hours. So only parts with a bounded result are accepted, and only known patterns.
@@ -9,6 +9,10 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from typing import Any, Final
+
+from tokenizers import Tokenizer
+
+from edge.artifacts.files import ArtifactError
 
 MAX_TOKENS: Final = 1 << 20
 MAX_TOKEN_CHARS: Final = 512
@@ -71,6 +75,17 @@ def check_tokenizer_file(content: bytes, special: Mapping[str, int]) -> int:
         found_id = added.get(token, model["vocab"].get(token))
         _require(found_id == wanted, f"{token} is id {found_id}, the network was built for {wanted}")
     return max((*ids, *added.values())) + 1
+
+
+def open_tokenizer(content: bytes) -> Tokenizer:
+    """Open a checked tokenizer.json; raises ArtifactError."""
+    try:
+        return Tokenizer.from_buffer(content)
+    except (KeyboardInterrupt, SystemExit):
+        raise
+    except BaseException as error:  # a panic of the library is no Exception
+        reason = (str(error).splitlines() or [""])[0][:160]
+        raise ArtifactError(f"tokenizer.json: not a tokenizer ({reason}); export again") from error
 
 
 def _check_section(section: str, kinds: frozenset[str], entry: Any) -> None:

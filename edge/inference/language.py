@@ -13,11 +13,9 @@ from functools import lru_cache
 
 import numpy as np
 import onnxruntime as ort
-from tokenizers import Tokenizer
 
-from edge.artifacts.files import ArtifactError
 from edge.artifacts.manifest import LEAST_ROWS, MOST_ROWS, Artifacts
-from edge.artifacts.tokenizer_file import MAX_TOKENS
+from edge.artifacts.tokenizer_file import MAX_TOKENS, open_tokenizer
 from edge.core.geometry import SE2
 from edge.inference.calls import Call, Chunk, Floats, chunks, set_first_apart, set_last_apart
 from edge.inference.graph import DTYPES, CancelledError, Graph, GraphError, Interrupt, zeros
@@ -71,17 +69,6 @@ class Generation:
         return len(self.token_ids)
 
 
-def _open_tokenizer(content: bytes) -> Tokenizer:
-    """Open a checked tokenizer.json; raises ArtifactError."""
-    try:
-        return Tokenizer.from_buffer(content)
-    except (KeyboardInterrupt, SystemExit):
-        raise
-    except BaseException as error:  # a panic of the library is no Exception
-        reason = (str(error).splitlines() or [""])[0][:160]
-        raise ArtifactError(f"tokenizer.json: not a tokenizer ({reason}); export again") from error
-
-
 class LanguageModel:
     """Prefill and greedy decoding over KV buffers that are allocated once."""
 
@@ -108,7 +95,7 @@ class LanguageModel:
                 for name in artifacts.language_graphs
             ],
         )
-        self.tokenizer = _open_tokenizer(artifacts.contents["tokenizer.json"])
+        self.tokenizer = open_tokenizer(artifacts.contents["tokenizer.json"])
         self.runtime = runtime
         ids = PromptIds(
             runtime.im_start_id, runtime.im_end_id, runtime.img_start_id, runtime.img_end_id, runtime.img_context_id
@@ -236,6 +223,13 @@ class LanguageModel:
         self.kept_ids = kept
         self._took_ns[len(chunk.ids)] = time.monotonic_ns() - started_ns
         return next_ids
+
+    def logits(self, chunk: Chunk, past: int) -> Floats:
+        """Feed a chunk after `past` tokens; return the logits after its last MOST_ROWS tokens. Raises GraphError."""
+        call = Call(self._graphs[-1], self._buffers, with_logits=True)
+        rows = len(self.run(call, chunk, past, None))
+        assert call.logits is not None
+        return call.logits[:rows]
 
     def expected_ns(self, tokens: int) -> int:
         """Return the duration of the last call with that many tokens, ns; 0 before the first."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import math
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.artifacts.files import ArtifactError
-from edge.artifacts.known_answers import CHAIN, SUMS, VOCABULARY, Answer, KnownAnswers
-from edge.artifacts.manifest import LANGUAGE_PAIR, Artifacts
+from edge.artifacts.known_answers import CHAIN, LATER, LOGITS, SUMS, VOCABULARY, Answer, KnownAnswers
+from edge.artifacts.manifest import LANGUAGE_PAIR, MOST_ROWS, Artifacts
 from edge.core.geometry import SE2
 from edge.inference.calls import Chunk
 from edge.inference.graph import Array, GraphError
@@ -117,7 +117,7 @@ def check_answers(policy: Policy, language: LanguageModel, known: KnownAnswers |
                 f"{where}: self-test: the prompt's token ids are not the exporter's: tokenizer, special tokens or "
                 f"this release's prompt differ; export again"
             )
-        for name, output in outputs(policy, language, noise, vocabulary=VOCABULARY in known.answers):
+        for name, output in outputs(policy, language, noise, later=LATER & known.answers.keys()):
             share = _compare(noise, name, output, known)
             if share >= worst_share:
                 worst, worst_share = name, share
@@ -148,11 +148,11 @@ def compute_answers(
 
 
 def outputs(
-    policy: Policy, language: LanguageModel, noise: Noise, *, vocabulary: bool = True
+    policy: Policy, language: LanguageModel, noise: Noise, *, later: Collection[str] = LATER
 ) -> Iterator[tuple[str, Output]]:
     """Run every graph on inputs of its own, then the chain; yield each answer when it is there. Raises GraphError.
 
-    `vocabulary`: whether to feed every token too.
+    `later`: which answers of LATER too.
     """
     runtime = language.runtime
     size = (1, runtime.image_px, runtime.image_px, 3)
@@ -161,8 +161,8 @@ def outputs(
     )
     yield "vision_encoder", Output(first.ravel(), other=second.ravel())
     visual = noise.numbers("visual tokens", policy.tokens_shape)
-    yield from _language(policy.artifacts, language, visual)
-    if vocabulary:
+    yield from _language(policy.artifacts, language, visual, logits=LOGITS in later)
+    if VOCABULARY in later:
         yield VOCABULARY, _vocabulary(language, noise)
     # Its answer is already proven where it reaches the action expert.
     guidance, context = _context(policy, language, noise)
@@ -180,8 +180,10 @@ def outputs(
     yield CHAIN, Output(policy.act(second, STATE, DELAY_S, OFFSET, semantic).ravel(), other=planned)
 
 
-def _language(artifacts: Artifacts, language: LanguageModel, visual: Floats) -> Iterator[tuple[str, Output]]:
-    """Prefill some of a frame's tokens and text, then decode given tokens one by one."""
+def _language(
+    artifacts: Artifacts, language: LanguageModel, visual: Floats, *, logits: bool
+) -> Iterator[tuple[str, Output]]:
+    """Prefill some of a frame's tokens and text, decode given tokens one by one, then read the logits after others."""
     image_id = language.runtime.img_context_id
     text = _text_ids(language)
     places = min(PLACEHOLDERS, language.runtime.frame_tokens)
@@ -200,6 +202,10 @@ def _language(artifacts: Artifacts, language: LanguageModel, visual: Floats) -> 
         yield LANGUAGE_PAIR[1], Output(after.ravel(), tuple(tokens), other=np.tile(after[0], len(after)))
     else:
         yield artifacts.language_graphs[0], Output(rows.ravel(), tuple(tokens), other=np.tile(rows[0], len(rows)))
+    if logits:
+        # The K‖V of the last layer do not depend on the layers behind it: a damaged row of `lm_head` shows only here.
+        scores = language.logits(Chunk(text[:MOST_ROWS], None, 0), filled)
+        yield LOGITS, Output(scores.ravel(), other=np.tile(scores[0], len(scores)))
 
 
 def _vocabulary(language: LanguageModel, noise: Noise) -> Output:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
-from edge.artifacts.known_answers import CHAIN, LIMITS_S, VOCABULARY, KnownAnswers
+from edge.artifacts.known_answers import CHAIN, LATER, LIMITS_S, LOGITS, VOCABULARY, KnownAnswers
 from edge.artifacts.manifest import LANGUAGE_PAIR, LANGUAGE_WHOLE, Artifacts
 from edge.artifacts.target_facts import plan_facts
 from edge.core.cli import EXIT_CHECK_FAILED
@@ -44,7 +44,7 @@ class SelfTestLimits:
     limit_s: float
     same_tokens: float
     tolerances: Mapping[str, float]
-    """By graph, CHAIN and VOCABULARY."""
+    """By graph, CHAIN and those of LATER."""
 
 
 def self_test_limits(manifest: Mapping[str, Any], *, half: bool, replaced: bool) -> SelfTestLimits:
@@ -58,14 +58,14 @@ def self_test_limits(manifest: Mapping[str, Any], *, half: bool, replaced: bool)
         for name, graph in manifest["graphs"].items()
     }
     worst = max(tolerances.values())
-    prefills = next((name for name in (LANGUAGE_WHOLE[0], LANGUAGE_PAIR[0]) if name in tolerances), None)
-    vocabulary = {} if prefills is None else {VOCABULARY: tolerances[prefills]}
+    language = [name for name in (*LANGUAGE_WHOLE, *LANGUAGE_PAIR) if name in tolerances]
+    later = {VOCABULARY: tolerances[language[0]], LOGITS: tolerances[language[-1]]} if language else {}
     plan = plan_facts(manifest)
     planned_s = 0.0 if plan is None else (plan.tick_alone_ms + float(manifest["plan"]["generation_alone_ms"])) / 1e3
     return SelfTestLimits(
         limit_s=round(min(max(LEAST_LIMIT_S, SLOWER * planned_s), LIMITS_S[1]), 1),
         same_tokens=SAME_TOKENS[worst],
-        tolerances={**tolerances, **vocabulary, CHAIN: CHAIN_FACTOR * worst},
+        tolerances={**tolerances, **later, CHAIN: CHAIN_FACTOR * worst},
     )
 
 
@@ -92,11 +92,11 @@ def recorded_and_expected_limits(
     accelerated = any(graph["session"]["provider"] != CPU_PROVIDER for graph in manifest["graphs"].values())
     # The exporting computer may have lacked the accelerator's provider, which this one has.
     both = [self_test_limits(manifest, half=half, replaced=replaced) for replaced in (False, True)]
-    if VOCABULARY not in answers:  # an earlier export
-        both = [
-            replace(limits, tolerances={name: each for name, each in limits.tolerances.items() if name != VOCABULARY})
-            for limits in both
-        ]
+    missing = LATER - answers.keys()
+    both = [
+        replace(limits, tolerances={name: each for name, each in limits.tolerances.items() if name not in missing})
+        for limits in both
+    ]
     expected = both[1] if accelerated and found == both[1] else both[0]
     return asdict(found), asdict(expected)
 

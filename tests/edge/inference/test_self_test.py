@@ -17,7 +17,7 @@ import pytest
 from onnx import TensorProto, helper
 
 from edge.artifacts.files import ArtifactError
-from edge.artifacts.known_answers import SUMS, VOCABULARY
+from edge.artifacts.known_answers import LATER, LOGITS, SUMS, VOCABULARY
 from edge.artifacts.manifest import Artifacts, load_artifacts
 from edge.inference import self_test
 from edge.inference.language import LanguageModel
@@ -62,14 +62,22 @@ def swap_rows(values: Floats) -> None:
 
 def damaged_token(change: Callable[[Floats], object]) -> Damage:
     """Change the embedding of a token that no prompt of the self-test contains."""
+    return changed("embed.weight", lambda values: change(values[1000]))
 
-    def change_row(model: onnx.ModelProto) -> None:
-        (tensor,) = (each for each in model.graph.initializer if each.name == "embed.weight")
+
+def damaged_output(change: Callable[[Floats], object]) -> Damage:
+    """Change the weights of the next token 1000, which the self-test's texts never choose."""
+    return changed("lm_head.weight", lambda values: change(values[:, 1000]))
+
+
+def changed(name: str, change: Callable[[Floats], object]) -> Damage:
+    def change_values(model: onnx.ModelProto) -> None:
+        (tensor,) = (each for each in model.graph.initializer if each.name == name)
         values = onnx.numpy_helper.to_array(tensor).copy()
-        change(values[1000])
+        change(values)
         tensor.raw_data = values.tobytes()
 
-    return lambda directory: edit_graph(directory, "language_model", change_row)
+    return lambda directory: edit_graph(directory, "language_model", change_values)
 
 
 def zero_all(graph: str, directory: Path) -> None:
@@ -156,6 +164,12 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
     "a token's embedding is 0": (damaged_token(partial(scale, 0.0)), "vocabulary answers otherwise"),
     "a token's embedding is scaled": (damaged_token(partial(scale, 1e4)), "vocabulary answers otherwise"),
     "a token's embedding is NaN": (damaged_token(partial(scale, np.nan)), "vocabulary gives .* not finite"),
+    "a next token is never chosen": (damaged_output(partial(scale, 0.0)), "logits answers otherwise"),
+    "a next token is always chosen": (damaged_output(partial(scale, 1e4)), "logits answers otherwise"),
+    "the weights of a next token are NaN": (damaged_output(partial(scale, np.nan)), "logits gives .* not finite"),
+    "two next tokens exchanged": (
+        changed("lm_head.weight", lambda values: swap_rows(values.T)), "logits answers otherwise"
+    ),
     "two tokens exchanged": (lambda d: exchange(d, "Ġleft", "Ġright"), "the prompt's token ids are not the exporter's"),
     "special tokens exchanged": (exchange_special, "the prompt's token ids are not the exporter's"),
     "a negative next token": (
@@ -163,7 +177,10 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
         r"the graphs do not run \(the language model's next tokens are \[-\d+",
     ),
 }  # fmt: skip
-FAST = ("one weight is NaN", "a matrix scaled by 0.99", "a token's embedding is 0", "two tokens exchanged")
+FAST = (
+    "one weight is NaN", "a matrix scaled by 0.99", "a token's embedding is 0", "a next token is never chosen",
+    "two tokens exchanged",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -244,8 +261,9 @@ def test_a_manifest_without_answers_is_refused(artifacts: Artifacts) -> None:
         open_proven(dataclasses.replace(artifacts, known_answers=None))
 
 
-def test_artifacts_of_an_earlier_export_without_an_answer_to_the_vocabulary_pass(copy: Path) -> None:
-    edit_manifest(copy, lambda m: m["self_test"]["answers"].pop(VOCABULARY))
+@pytest.mark.parametrize("without", [{LOGITS}, LATER], ids=["logits", "logits and vocabulary"])
+def test_artifacts_of_an_earlier_export_without_a_later_answer_pass(copy: Path, without: set[str]) -> None:
+    edit_manifest(copy, lambda m: [m["self_test"]["answers"].pop(name) for name in without])
     assert open_proven(load_artifacts(copy)).tested.worst_share < 0.1
 
 
