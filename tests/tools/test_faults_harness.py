@@ -22,8 +22,9 @@ from sim_hil.protocols.fault_socket import FaultClient, FaultError
 from sim_hil.protocols.mavlink.parameters import TABLE
 from sim_hil.protocols.ros2.front_end import BASE_TIMEOUT_S
 from sim_hil.realtime.robots import ROBOTS, StackRobot
+from tests.support.processes import wait_for
 from tools.faults import __main__ as command
-from tools.faults.busy import busy_processes
+from tools.faults.busy import busy_processes, paused
 from tools.faults.measure import Sample
 from tools.faults.report import RowResult, markdown, read_results, result
 from tools.faults.rig import circle, driver
@@ -213,6 +214,16 @@ def test_the_load_is_so_many_processes_that_end_with_the_measurement() -> None:
         commands = [Path(f"/proc/{pid}/cmdline").read_bytes() for pid in pids]
     assert len(set(pids)) == 2 and all(b"while True" in one for one in commands)
     assert not any(Path(f"/proc/{pid}").exists() for pid in pids)
+
+
+def test_the_load_stands_still_while_a_run_starts() -> None:
+    def states(pids: list[int]) -> set[str]:
+        return {Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] for pid in pids}
+
+    with busy_processes(2) as pids:
+        with paused(pids):
+            wait_for(lambda: states(pids) == {"T"}, 10.0, "busy processes to stand still")
+        wait_for(lambda: states(pids) == {"R"}, 10.0, "busy processes to go on")
 
 
 def test_a_number_of_injections_holds_for_slow_rows_too() -> None:

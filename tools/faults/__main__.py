@@ -80,7 +80,7 @@ def parser() -> argparse.ArgumentParser:
         type=int,
         default=0,
         metavar="N",
-        help="keep N busy processes of ordinary priority beside (default: 0)",
+        help="keep N busy processes of ordinary priority beside, while the robot drives (default: 0)",
     )
     p.add_argument("--seed", type=int, default=0, help="seed of the injection times (default: 0)")
     p.add_argument("--robot", choices=tuple(ROBOTS), default=GO2.name, help=f"robot to drive (default: {GO2.name})")
@@ -192,7 +192,7 @@ def run(args: argparse.Namespace, wanted: Sequence[Row]) -> list[RowResult]:
         rig = stack.enter_context(Rig(folder, args.artifacts.absolute(), args.domain, _print, stack_robot=robot))
         _print(f"starting the robot's side: {robot.name}, {rig.config.address}")
         rig.start()
-        stack.enter_context(busy_processes(args.load))
+        rig.busy = stack.enter_context(busy_processes(args.load))
         rng = random.Random(args.seed)
         for row in wanted:
             times, kept = count(row, args.per_row), results.get(row.name)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import Final
@@ -28,3 +29,15 @@ def busy_processes(count: int) -> Iterator[list[int]]:
             stack.callback(child.kill)  # runs before its context, which waits for it
             started.append(child.pid)
         yield started
+
+
+@contextmanager
+def paused(processes: Iterable[int]) -> Iterator[None]:
+    """Let the processes with these ids stand still inside the context."""
+    for process in processes:
+        os.kill(process, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        for process in processes:
+            os.kill(process, signal.SIGCONT)

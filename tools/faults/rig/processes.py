@@ -25,6 +25,7 @@ from firmware_bridge.core.config import BRIDGE_PRIORITY, RobotConfig, load_robot
 from sim_hil.processes.child_process import last_lines
 from sim_hil.protocols.fault_socket import FaultClient, FaultError
 from sim_hil.realtime.children import Child, Children, StepError
+from sim_hil.realtime.host_stall import STALL_PRIORITY
 from sim_hil.realtime.robots import (
     BRIDGE_SOCKET,
     CAN_BETWEEN_PROCESSES,
@@ -37,6 +38,7 @@ from sim_hil.realtime.robots import (
 from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_PRIORITY
 from sim_hil.realtime.truth import LineTail
 from tools.demo import INSTRUCTION
+from tools.faults.busy import paused
 from tools.faults.rig.circle import SPEED_MPS
 from tools.faults.rig.received import ReceivedCommands
 
@@ -46,6 +48,8 @@ _POLL_S = 0.01
 _STEADY_MOVES = 10  # 0.2 s of the bridge's commands
 _STEADY_SHARE = 0.9
 _ATTEMPTS = 4
+_LOADED_S = 1.0
+"""Time beside the busy processes before an injection into a new run."""
 _COMMANDER_S = 2.2
 _PERMIT_TIMEOUT_S = 4.0
 
@@ -90,6 +94,8 @@ class Rig:
         self.received = ReceivedCommands(folder / ("received.jsonl" if self._sniffs else "trace.jsonl"))
         self.stand_in = self._is_stand_in = False
         """Whether the next injection may be made into a run of the runner's stand-in."""
+        self.busy: Sequence[int] = ()
+        """Ids of the busy processes beside the rig; they stand still while a bridge or a runner starts."""
         self.jump_m = 1.0
         self.needs_operator = False
         self._artifacts = artifacts
@@ -135,7 +141,9 @@ class Rig:
         waited = [(self.hil, READY_LINE)]
         if self._sniffs:
             sniffer = [sys.executable, "-m", "tools.faults.rig.sniffer", self.stack_robot.protocol, self._bus]
-            child = self._children.start("sniffer", [*sniffer, "--out", str(self.folder / "received.jsonl")])
+            sniffer += ["--out", str(self.folder / "received.jsonl")]
+            # Of ordinary priority it would stamp late beside busy processes, and the reaction would seem late.
+            child = self._children.start("sniffer", sniffer, fifo_priority=STALL_PRIORITY)
             waited.append((child, "sniffer: ready"))
         for child, line in waited:
             self._wait(partial(_has_printed, child, line), READY_TIMEOUT_S, child, line)
@@ -170,6 +178,13 @@ class Rig:
         """Start what is not running and wait until the robot is driven at full speed. Raises StepError."""
         if self._is_stand_in != self.stand_in:
             self.kill_runner()
+        runs = all(child is not None and child.running for child in (self.bridge, self.runner))
+        with paused(() if runs else self.busy):
+            self._ensure_moving()
+        if not runs and self.busy:
+            time.sleep(_LOADED_S)
+
+    def _ensure_moving(self) -> None:
         for _ in range(_ATTEMPTS):
             if self.bridge is None or not self.bridge.running:
                 self.kill_runner()
