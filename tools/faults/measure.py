@@ -47,6 +47,7 @@ class Sample:
 
 def injection(rig: Rig, row: Row, rng: random.Random, host: HostStall) -> Sample:
     """Make one injection into a robot that moves. Raises StepError or FaultError if the rig does not work."""
+    rig.robot_obeys_motion()  # the trace of an hour of other rows takes longer to read than a bound
     time.sleep(rng.uniform(0.0, PHASE_S))
     before_ns = time.monotonic_ns()
     new = rig.received.sources() - {one.source for one in rig.received.since(before_ns - _RECENT_NS)}
