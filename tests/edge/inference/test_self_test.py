@@ -165,7 +165,7 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
     "a token's embedding is scaled": (damaged_token(partial(scale, 1e4)), "vocabulary answers otherwise"),
     "a token's embedding is NaN": (damaged_token(partial(scale, np.nan)), "vocabulary gives .* not finite"),
     "a next token is never chosen": (damaged_output(partial(scale, 0.0)), "logits answers otherwise"),
-    "a next token is always chosen": (damaged_output(partial(scale, 1e4)), "logits answers otherwise"),
+    "a next token is always chosen": (damaged_output(partial(scale, 1e4)), "language_model chooses other tokens"),
     "the weights of a next token are NaN": (damaged_output(partial(scale, np.nan)), "logits gives .* not finite"),
     "two next tokens exchanged": (
         changed("lm_head.weight", lambda values: swap_rows(values.T)), "logits answers otherwise"
