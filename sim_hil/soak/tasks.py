@@ -60,12 +60,13 @@ class Journey:
 
     def begin(self) -> Vec3:
         """Return a start pose for a leg from which a task exists. Raises ValueError."""
+        why = ""
         for _ in range(TRIES):
             try:
                 return sample_task(self.scene, self._grid, self._rng, length_m=self._length_m).start
-            except RouteError:
-                continue
-        raise ValueError(f"scene {self.scene.name}: no task found in {TRIES} tries; expected one with landmarks")
+            except RouteError as error:
+                why = str(error)
+        raise ValueError(f"scene {self.scene.name}: no task found in {TRIES} tries ({why}); give another scene")
 
     def next(self, at: Vec3) -> SoakTask | None:
         """Return a task from pose `at`; None if no landmark can be reached.

@@ -24,10 +24,10 @@ from sim_hil.protocols.ros2.front_end import BASE_TIMEOUT_S
 from sim_hil.realtime.robots import ROBOTS, StackRobot
 from tests.support.processes import wait_for
 from tools.faults import __main__ as command
-from tools.faults.busy import busy_processes, paused
 from tools.faults.measure import Sample
 from tools.faults.report import RowResult, markdown, read_results, result
 from tools.faults.rig import circle, driver
+from tools.faults.rig.busy import busy_processes, paused
 from tools.faults.rig.received import ReceivedCommands, first_lasting, longest_age_ms, longest_gap_ms
 from tools.faults.rig.switches import Switches
 from tools.faults.rows import CONTRACT, NOT_INJECTED, Judge, Row, rows

@@ -40,9 +40,9 @@ from sim_hil.realtime.children import StepError, uninterrupted
 from sim_hil.realtime.host_stall import HostStall
 from sim_hil.realtime.robots import GO2, MAX_DOMAIN, ROBOTS, StackRobot
 from sim_hil.realtime.stack import socket_dir
-from tools.faults.busy import MOST_BUSY, busy_processes
 from tools.faults.measure import Sample, injection
 from tools.faults.report import RowResult, markdown, read_results, result, show
+from tools.faults.rig.busy import MOST_BUSY, busy_processes
 from tools.faults.rig.processes import Rig
 from tools.faults.rows import CONTRACT, Judge, Row, rows
 from tools.report.machine import machine_facts

@@ -103,6 +103,8 @@ def starts(scene: Scene) -> list[Area]:
 def draw_start(scene: Scene, grid: NavGrid, rng: np.random.Generator) -> Vec3:
     """Draw a free pose along a corridor or in a room. Raises RouteError if none was found."""
     areas = starts(scene)
+    if not areas:
+        raise RouteError("the scene has no area to start in")
     # Corridors are weighted by length, rooms by a constant.
     weights = np.array([_weight(area) for area in areas])
     for _ in range(50):

@@ -19,6 +19,30 @@ from sim_hil.soak.cli import main
 from sim_hil.soak.tasks import LENGTH_M, Journey, SoakTask, TaskRun
 
 S = 1_000_000_000
+SMALL_ROOM = """
+name = "room"
+start = [0.0, 0.0, 0.0]
+goal_xy = [1.0, 0.0]
+ceiling_height_m = 2.6
+[floor]
+min_m = [-1.5, -1.5]
+max_m = [1.5, 1.5]
+texture = "floor_tiles"
+[[areas]]
+label = "room"
+kind = "room"
+name = "room"
+polygon = [[-1.5, -1.5], [1.5, -1.5], [1.5, 1.5], [-1.5, 1.5]]
+[[objects]]
+label = "plant"
+kind = "plant"
+landmark = "plant"
+position_m = [1.2, 1.2, 0.0]
+heading_deg = 180
+size_m = [0.3, 0.3, 1.0]
+colour = [0.2, 0.4, 0.2]
+"""
+"""Every task in it would be shorter than a soak's."""
 
 
 @pytest.fixture(scope="module")
@@ -30,10 +54,11 @@ def test_a_scene_without_a_reachable_task_is_refused_before_the_first_leg(
     artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "soak"
-    scenes = ["--scene", "office", "--scene", "corridor"]
+    (tmp_path / "room.toml").write_text(SMALL_ROOM)
+    scenes = ["--scene", "office", "--scene", str(tmp_path / "room.toml")]
     assert main(["--artifacts", str(artifacts_dir), "--duration", "10m", *scenes, "--out", str(out)]) == EXIT_BAD_INPUT
     (line,) = capsys.readouterr().err.splitlines()
-    assert "scene corridor: no task found in 24 tries" in line and not out.exists()
+    assert "scene room: no task found in 24 tries (" in line and not out.exists()
 
 
 @pytest.mark.slow

@@ -38,7 +38,7 @@ from sim_hil.realtime.robots import (
 from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_PRIORITY
 from sim_hil.realtime.truth import LineTail
 from tools.demo import INSTRUCTION
-from tools.faults.busy import paused
+from tools.faults.rig.busy import paused
 from tools.faults.rig.circle import SPEED_MPS
 from tools.faults.rig.received import ReceivedCommands
 
