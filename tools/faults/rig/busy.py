@@ -6,7 +6,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import Final
@@ -32,7 +32,7 @@ def busy_processes(count: int) -> Iterator[list[int]]:
 
 
 @contextmanager
-def paused(processes: Iterable[int]) -> Iterator[None]:
+def paused(processes: Collection[int]) -> Iterator[None]:
     """Let the processes with these ids stand still inside the context."""
     for process in processes:
         os.kill(process, signal.SIGSTOP)
