@@ -162,7 +162,9 @@ def test_tolerances_of_an_exporter_without_the_provider_are_accepted_for_an_acce
     assert (found == expected) is accepted
 
 
-@pytest.mark.parametrize("without", [*({name} for name in sorted(LATER)), LATER], ids=str)
+@pytest.mark.parametrize(
+    "without", [*({name} for name in sorted(LATER)), LATER], ids=lambda names: "+".join(sorted(names))
+)
 def test_limits_of_an_earlier_export_without_a_later_answer_are_accepted(without: set[str]) -> None:
     graph = {"precision": {"default": "fp32", "overrides": {}}, "session": {"provider": "CPUExecutionProvider"}}
     content = {"graphs": {"language_model": graph}, "plan": {}}
