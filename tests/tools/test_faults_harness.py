@@ -24,6 +24,7 @@ from sim_hil.protocols.ros2.front_end import BASE_TIMEOUT_S
 from sim_hil.realtime.robots import ROBOTS, StackRobot
 from tests.support.processes import wait_for
 from tools.faults import __main__ as command
+from tools.faults import measure
 from tools.faults.measure import Sample
 from tools.faults.report import RowResult, markdown, read_results, result
 from tools.faults.rig import circle, driver
@@ -321,11 +322,14 @@ def test_bad_arguments_are_refused_in_one_line(
 
 
 class Hindered:
-    """A rig whose robot does not drive on, the first `times`; its runner takes `start_s` to start."""
+    """A rig whose injection is hindered, the first `times`; its runner takes `start_s` to start."""
 
     stand_in = False
 
-    def __init__(self, times: int, monkeypatch: pytest.MonkeyPatch, start_s: float = 0.0) -> None:
+    def __init__(
+        self, times: int, monkeypatch: pytest.MonkeyPatch, start_s: float = 0.0, latency_ms: float | None = 100.0
+    ) -> None:
+        self.latency_ms = latency_ms
         self.left, self.start_s, self.now_s, self.injected_s = times, start_s, 0.0, list[float]()
         monkeypatch.setattr(command, "injection", self.injection)
         clock = SimpleNamespace(monotonic_ns=lambda: round(self.now_s * 1e9), sleep=self.sleep)
@@ -340,7 +344,7 @@ class Hindered:
     def injection(self, *_: object) -> Sample:
         self.injected_s.append(self.now_s)
         self.left -= 1
-        return Sample(100.0, 0.0, hindered=["did not drive on"] if self.left >= 0 else [])
+        return Sample(self.latency_ms, 0.0, hindered=["x"]) if self.left >= 0 else Sample(100.0, 0.0)
 
 
 @pytest.mark.parametrize(("times", "repeated", "passes"), [(0, 0, True), (1, 1, True), (2, 1, False)])
@@ -351,6 +355,37 @@ def test_a_robot_that_does_not_drive_on_fails_a_row_only_twice_in_a_row(
     result = command.run_row(rig, row(), 1, random.Random(0), None)  # type: ignore[arg-type]
     assert result.repeated == repeated and (not result.problems) == passes
     assert len(result.samples) == 1 + repeated
+
+
+@pytest.mark.parametrize(("times", "samples", "passes"), [(1, [100.0], True), (2, [None], False)])
+def test_a_fault_that_hit_a_robot_that_stood_counts_only_twice_in_a_row(
+    times: int, samples: list[float | None], passes: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = Hindered(times, monkeypatch, latency_ms=None)
+    result = command.run_row(rig, row(), 1, random.Random(0), None)  # type: ignore[arg-type]
+    assert [one.latency_ms for one in result.samples] == samples and result.repeated == 1
+    assert (not result.problems) == passes
+
+
+@pytest.mark.parametrize(("stood_ms", "judged"), [(None, True), (-5, False), (-500, False)])
+def test_an_injection_is_judged_only_if_the_robot_moved_before_it(
+    stood_ms: int | None, judged: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    obeys, effects = [(-10_000 * MS, True)], list[int]()
+    rig = SimpleNamespace(
+        robot_obeys_motion=lambda: obeys,
+        received=SimpleNamespace(since=lambda _: [], sources=frozenset),
+    )
+
+    def inject(_: object) -> int:
+        effects.append(time.monotonic_ns())
+        obeys.append((effects[0] + (5 if stood_ms is None else stood_ms) * MS, False))
+        return effects[0]
+
+    monkeypatch.setattr(measure, "_aftermath", lambda *_: None)
+    one = Row("test", None, inject, judge=Judge.ROBOT, bound=10.0)
+    sample = measure.injection(rig, one, random.Random(0), SimpleNamespace(between_ns=lambda *_: 0))  # type: ignore[arg-type]
+    assert (sample.latency_ms == 5.0) == judged and (sample.hindered == []) == judged
 
 
 def test_the_pause_of_a_row_is_between_two_injections_however_long_the_runner_takes_to_start(

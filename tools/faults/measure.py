@@ -9,7 +9,14 @@ from dataclasses import dataclass, field
 
 from sim_hil.realtime.host_stall import HostStall
 from tools.faults.rig.processes import Rig
-from tools.faults.rig.received import ReceivedCommand, first_lasting, longest_age_ms, longest_gap_ms, moves
+from tools.faults.rig.received import (
+    ReceivedCommand,
+    first_lasting,
+    longest_age_ms,
+    longest_gap_ms,
+    moves,
+    moving_at,
+)
 from tools.faults.rows import Judge, Row
 
 PHASE_S = 0.1
@@ -59,6 +66,10 @@ def injection(rig: Rig, row: Row, rng: random.Random, host: HostStall) -> Sample
         sample = _fresh(rig, effect_ns, host)
     else:
         sample = _awaited(rig, row, effect_ns, commanders, host)
+    if not moving_at(rig.robot_obeys_motion(), before_ns):
+        # The fault hit a robot that stood: neither a late reaction nor one in time.
+        sample.latency_ms = None
+        sample.hindered.append("the robot stood before the fault")
     _aftermath(rig, row, sample, commanders)
     return sample
 

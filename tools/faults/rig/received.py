@@ -89,6 +89,11 @@ def longest_gap_ms(stamped: Sequence[tuple[int, Velocity]], begin_ns: int, end_n
     return max(b - a for a, b in itertools.pairwise(stamps)) / 1e6
 
 
+def moving_at(obeys: Sequence[tuple[int, bool]], t_ns: int) -> bool:
+    """Return whether the robot obeyed motion at `t_ns`; `obeys`: times at which it began or ceased to, in order."""
+    return next((moving for since_ns, moving in reversed(obeys) if since_ns <= t_ns), False)
+
+
 def longest_age_ms(received_ns: Sequence[int], obeys: Sequence[tuple[int, bool]], begin_ns: int, end_ns: int) -> float:
     """Return the longest age of the newest received command while the robot obeys motion, in a window, ms.
 
