@@ -43,11 +43,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser().parse_args(argv)
     try:
         check(args)
-        options = options_of(args)
         menus = {"none": None, "default": DEFAULT_MENU}
         menu_file = menus.get(args.faults, Path(args.faults))
         menu = None if menu_file is None else load_menu(menu_file).for_robot(ROBOTS[args.robot])
         budget = applicable(load_budget(args.budget or DEFAULT_BUDGET), faults=menu is not None)
+        options = options_of(args)  # last: a task is drawn in every scene
         soak = (SoakFolder.resume if args.resume else SoakFolder.create)(args.out.absolute(), options)
     except ArtifactError as error:
         return _report_error(error, EXIT_REFUSED)
