@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import math
 import sys
 import types
@@ -38,8 +39,9 @@ def near(name: str, known: typing.Iterable[str]) -> str:
     return f"expected one of: {', '.join(names)}" if names else "nothing is expected there"
 
 
-def field_types(cls: type) -> dict[str, Any]:
-    """Return the type of every field of a dataclass."""
+@functools.cache
+def field_types(cls: type) -> Mapping[str, Any]:
+    """Return the type of every field of a dataclass; they are resolved once, which is most of a file's reading."""
     hints = typing.get_type_hints(cls)
     return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
 
@@ -48,7 +50,7 @@ def build(cls: type[T], content: object, where: str) -> T:
     """Build the dataclass `cls` from a table. Raises FieldError that names `where`."""
     if not isinstance(content, Mapping):
         raise FieldError(f"{where}: expected a table, found {content!r}")
-    known = field_types(cls)
+    known = field_types(cls)  # type: ignore[arg-type]  # mypy takes a dataclass for unhashable; it is the class
     for key in content:
         if key not in known:
             raise FieldError(f"{where}: unknown key {key!r}; {near(str(key), known)}")

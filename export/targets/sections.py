@@ -34,7 +34,8 @@ def _require(ok: bool, message: str) -> None:
 
 
 def _known(name: str, known: Mapping[str, object] | tuple[str, ...], what: str) -> None:
-    _require(name in known, f"{what} {name!r} is not known; {near(name, known)}")
+    if name not in known:
+        raise TargetError(f"{what} {name!r} is not known; {near(name, known)}")
 
 
 @dataclass(frozen=True)

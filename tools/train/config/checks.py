@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf
@@ -64,7 +65,8 @@ Quality: TypeAlias = Annotated[int, Range(1, 100)]
 """JPEG quality."""
 
 
-def ranges_of(config: type) -> dict[str, Range]:
+@functools.cache
+def ranges_of(config: type) -> Mapping[str, Range]:
     """Return the range of every field of a class that has one."""
     hints = get_type_hints(config, include_extras=True)
     found = {name: [each for each in get_args(hint) if isinstance(each, Range)] for name, hint in hints.items()}
@@ -76,7 +78,7 @@ class Checked:
     """A configuration whose numbers lie within the ranges of their types. Raises ValueError when it is built."""
 
     def __post_init__(self) -> None:
-        for name, allowed in ranges_of(type(self)).items():
+        for name, allowed in ranges_of(type(self)).items():  # type: ignore[arg-type]  # as in `build`
             if (value := getattr(self, name)) not in allowed:
                 raise ValueError(f"{name}: expected {allowed}, found {value:g}")
 

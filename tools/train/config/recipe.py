@@ -227,6 +227,6 @@ def _set(content: dict[str, Any], kinds: Mapping[str, type], setting: str) -> No
     table[path[-1]] = from_text(known[path[-1]], text, where)
 
 
-def _fields_of(kind: object) -> dict[str, Any]:
+def _fields_of(kind: object) -> Mapping[str, Any]:
     """Return the types of a dataclass's fields; empty for other types."""
     return field_types(kind) if isinstance(kind, type) and is_dataclass(kind) else {}
