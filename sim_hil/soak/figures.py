@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import cv2
 import numpy as np
-from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from reporting.plot_style import BAD, COMMAND, INK, MUTED, PERSON, TRUTH, legend_above, new_figure, png, tidy
@@ -15,6 +14,9 @@ from sim_hil.scene.map import draw_map, draw_mark, draw_path, map_view
 from sim_hil.scene.scene import Scene
 from sim_hil.soak.trends import SERIES, jitter_ms, offsets_s, soak_times_s, trend, windows
 from sim_hil.soak.verdict import MIB, process_lives
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 Array = NDArray[np.float64]
 Analysis = Mapping[str, Any]

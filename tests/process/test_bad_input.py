@@ -12,7 +12,7 @@ import pytest
 
 from edge.commands import COMMANDS
 from tests.support.bad_input.commands import TABLE, TOOLS
-from tests.support.bad_input.harness import Answer, Command, cases, prepare, run
+from tests.support.bad_input.harness import Answer, Command, Servers, cases, prepare, run
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 FEW = ("missing", "deep-list", "fifo", "loop", "not-utf8", "escape-name", "text ''")
@@ -30,6 +30,12 @@ def folder() -> Iterator[Path]:
         yield Path(made)
 
 
+@pytest.fixture(scope="module")
+def servers() -> Iterator[Servers]:
+    with Servers() as made:
+        yield made
+
+
 def placed(command: Command, artifacts: Path) -> Command:
     """Put the artifact directory into the command lines of a row."""
     good, quick = (text.replace("{artifacts}", str(artifacts)) for text in (command.good, command.quick))
@@ -43,18 +49,20 @@ def describe(answers: list[Answer]) -> str:
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("command", [*TABLE, *TOOLS], ids=lambda command: command.name)
-def test_every_bad_input_is_refused_in_one_clear_line(command: Command, folder: Path, artifacts_dir: Path) -> None:
+def test_every_bad_input_is_refused_in_one_clear_line(
+    command: Command, folder: Path, servers: Servers, artifacts_dir: Path
+) -> None:
     command = placed(command, artifacts_dir)
-    answers = run(command, folder, list(cases(command, folder)))
+    answers = run(command, folder, list(cases(command, folder)), servers)
     assert not any(answer.faults for answer in answers), describe(answers)
 
 
-def test_a_few_bad_inputs_of_the_operators_commands(folder: Path) -> None:
+def test_a_few_bad_inputs_of_the_operators_commands(folder: Path, servers: Servers) -> None:
     for command in TABLE:
         if command.name in ("edge-bridge status", "edge-say"):
             quick = replace(command, name=f"{command.name} quick")
             chosen = [case for case in cases(quick, folder) if case.bad.label in FEW]
-            answers = run(quick, folder, chosen)
+            answers = run(quick, folder, chosen, servers)
             assert len(answers) >= 5 and not any(answer.faults for answer in answers), describe(answers)
 
 

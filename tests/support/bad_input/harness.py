@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from edge.signature import keygen
 from tests.support.bad_input.values import Bad, full_outputs
@@ -106,8 +106,37 @@ def cases(command: Command, folder: Path) -> Iterator[Case]:
         yield full
 
 
-def run(command: Command, folder: Path, chosen: Sequence[Case]) -> list[Answer]:
-    """Run cases of a command in forks of one process and judge the answers."""
+class Servers:
+    """Processes that run cases, one for each module, which is imported once; a context manager that ends them."""
+
+    def __init__(self) -> None:
+        self._started: dict[str, subprocess.Popen[str]] = {}
+
+    def __enter__(self) -> Servers:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for server in self._started.values():
+            with server:  # waits for its end
+                pass
+
+    def answers(self, module: str, function: str, sent: Sequence[Mapping[str, object]]) -> list[dict[str, Any]]:
+        """Run the cases in forks of the module's process; returns one answer for each."""
+        if module not in self._started:
+            self._started[module] = subprocess.Popen(
+                [sys.executable, "-m", "tests.support.bad_input.server"],
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+                env={**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "120"},
+            )  # fmt: skip
+        server = self._started[module]
+        assert server.stdin is not None and server.stdout is not None
+        server.stdin.write(json.dumps({"module": module, "function": function, "cases": sent}) + "\n")
+        server.stdin.flush()
+        return [json.loads(server.stdout.readline()) for _ in sent]
+
+
+def run(command: Command, folder: Path, chosen: Sequence[Case], servers: Servers) -> list[Answer]:
+    """Run cases of a command and judge the answers."""
     sent = []
     for number, case in enumerate(chosen):
         own = folder / "runs" / f"{command.name.replace(' ', '-')}-{number}"
@@ -120,15 +149,8 @@ def run(command: Command, folder: Path, chosen: Sequence[Case]) -> list[Answer]:
             }
         )  # fmt: skip
     before = _listing(folder / "bad" / "outputs")
-    order = {"module": command.module, "function": command.function, "cases": sent}
-    done = subprocess.run(
-        [sys.executable, "-m", "tests.support.bad_input.server"],
-        input=json.dumps(order), stdout=subprocess.PIPE, text=True, check=True,
-        env={**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "120"},
-    )  # fmt: skip
     answers = []
-    for case, about, line in zip(chosen, sent, done.stdout.splitlines(), strict=True):
-        found = json.loads(line)
+    for case, about, found in zip(chosen, sent, servers.answers(command.module, command.function, sent), strict=True):
         left = {name for name in _listing(Path(str(about["cwd"]))) if not name.startswith(CACHE)}
         faults = _judge(command, case, found["code"], found["err"], left)
         answers.append(Answer(case, found["code"], found["err"], found["s"], faults))

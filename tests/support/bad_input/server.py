@@ -1,4 +1,4 @@
-"""Runs cases of one command: imports it once, then forks for each case. Run as a program, cases on standard input.
+"""Runs cases of commands: imports a command once, then forks for each case. Run as a program, cases on standard input.
 
 What a case imports is imported here after it, so that the cases after it find it loaded.
 """
@@ -27,19 +27,20 @@ KEPT_BYTES: Final = 20_000
 
 
 def main() -> None:
-    """Read (module, function, cases) as JSON; write one JSON answer a line, in the order of the cases."""
-    order = json.load(sys.stdin)
+    """Read (module, function, cases) as a line of JSON; write one JSON answer a line, in the order of the cases."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # modules that print when they are loaded
-    function = getattr(importlib.import_module(order["module"]), order["function"])
-    for case in order["cases"]:
-        with tempfile.TemporaryFile("w+", encoding="utf-8") as modules:
-            answers.write(json.dumps(_answer(function, case, modules)) + "\n")
-            answers.flush()
-            modules.seek(0)
-            for module in modules.read().split():
-                with contextlib.suppress(ImportError):  # not all of them are files
-                    importlib.import_module(module)
+    for line in sys.stdin:
+        order = json.loads(line)
+        function = getattr(importlib.import_module(order["module"]), order["function"])
+        for case in order["cases"]:
+            with tempfile.TemporaryFile("w+", encoding="utf-8") as modules:
+                answers.write(json.dumps(_answer(function, case, modules)) + "\n")
+                answers.flush()
+                modules.seek(0)
+                for module in modules.read().split():
+                    with contextlib.suppress(ImportError):  # not all of them are files
+                        importlib.import_module(module)
 
 
 def _answer(function: Any, case: dict[str, Any], modules: TextIO) -> dict[str, Any]:
