@@ -38,13 +38,12 @@ from firmware_bridge.system.terminal import CommandParser
 from reporting.progress import Progress
 from sim_hil.realtime.children import Child, Children, StepError
 from sim_hil.realtime.robots import BRIDGE_SOCKET, GO2, ROBOTS, RunAddress, StackRobot, StackRobotError, free_domain
-from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_PRIORITY, socket_dir
+from sim_hil.realtime.stack import COMMANDS, INSTRUCTION, READY_LINE, ROBOT_PRIORITY, socket_dir
 from sim_hil.realtime.truth import LineTail
 from tools.report.demo_report import RunFiles, write_report
 from tools.report.machine import machine_facts
 from tools.report.run_data import Record, ReportError
 
-INSTRUCTION = "walk down the corridor and stop at the vending machine"
 RELEASE_DELAY_S = 2
 MODEL = "nano"
 UNTRAINED_SPEED_MPS = 0.14

@@ -35,6 +35,9 @@ COMMANDS: Mapping[str, Sequence[str]] = {
     "edge-run": (sys.executable, "-m", "edge.run.command"),
 }
 
+INSTRUCTION = "walk down the corridor and stop at the vending machine"
+"""Instruction of the demo, the faults and the measurements in the scene `corridor`."""
+
 ROBOT_PRIORITY = 35
 """Real-time priority of the robot's side where permitted: a robot has a computer of its own, so neither ordinary
 programs nor reasoning, which computes for long, may slow it. Ticks and the bridge come first.

@@ -37,10 +37,9 @@ from edge.run import session
 from edge.state.semantic import SemanticState
 from sim_hil.realtime.children import Children, StepError
 from sim_hil.realtime.robots import GO2
-from sim_hil.realtime.stack import socket_dir
+from sim_hil.realtime.stack import INSTRUCTION, socket_dir
 from tools.bench import bad_input, command_parser
 from tools.bench.stop import start_robot
-from tools.demo import INSTRUCTION
 from tools.faults.rig import circle
 
 BLOCK_S = 8.0

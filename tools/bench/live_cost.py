@@ -33,12 +33,11 @@ from edge.flightlog.reader import RecordingError, read_messages
 from edge.run import command as runner
 from sim_hil.realtime.children import Child, Children, StepError
 from sim_hil.realtime.robots import GO2
-from sim_hil.realtime.stack import ARMED_LINE, socket_dir
+from sim_hil.realtime.stack import ARMED_LINE, INSTRUCTION, socket_dir
 from tools.bench import bad_input, command_parser
 from tools.bench.contention import circling_plans
 from tools.bench.live_viewers import VIEWERS
 from tools.bench.stop import start_robot
-from tools.demo import INSTRUCTION
 
 NONE, ALONE, ONE, FIVE = "no view", "no viewer", "one viewer", "five viewers"
 CONDITIONS: Final = (NONE, ALONE, ONE, FIVE)

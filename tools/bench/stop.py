@@ -22,9 +22,8 @@ from edge.core.cli import EXIT_CHECK_FAILED, EXIT_DONE, check_result_target, com
 from firmware_bridge.core.config import BRIDGE_PRIORITY
 from sim_hil.realtime.children import Child, Children, StepError
 from sim_hil.realtime.robots import GO2, ROBOTS, RunAddress, StackRobot
-from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_PRIORITY, socket_dir
+from sim_hil.realtime.stack import COMMANDS, INSTRUCTION, READY_LINE, ROBOT_PRIORITY, socket_dir
 from tools.bench import bad_input, command_parser
-from tools.demo import INSTRUCTION
 
 SIGNALS = (signal.SIGKILL, signal.SIGSTOP)
 BOUND_MS = 300.0

@@ -31,11 +31,11 @@ from edge.state.pose_history import PoseHistory
 from edge.state.ring import EncodedFrame, TokenRing
 from edge.state.semantic import SemanticState
 from edge.state.switches import Speculation
+from sim_hil.realtime.stack import INSTRUCTION
 from tools.memory.samples import picture
 
 Operation = Callable[[int], None]
 """One operation; it takes its number."""
-INSTRUCTION = "walk down the corridor and stop at the vending machine"
 _TICK_NS = 100_000_000
 _NEW_FRAMES = 20
 """Ticks between two generations: about 2 s."""

@@ -35,9 +35,8 @@ from sim_hil.realtime.robots import (
     RunAddress,
     StackRobot,
 )
-from sim_hil.realtime.stack import COMMANDS, READY_LINE, ROBOT_PRIORITY
+from sim_hil.realtime.stack import COMMANDS, INSTRUCTION, READY_LINE, ROBOT_PRIORITY
 from sim_hil.realtime.truth import LineTail
-from tools.demo import INSTRUCTION
 from tools.faults.rig.busy import paused
 from tools.faults.rig.circle import SPEED_MPS
 from tools.faults.rig.received import ReceivedCommands

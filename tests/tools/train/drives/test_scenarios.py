@@ -13,9 +13,9 @@ from sim_hil.benchmark.language.instructions import is_held_out, pattern
 from sim_hil.benchmark.language.tasks import facing
 from sim_hil.benchmark.suite.episode import load_suite
 from sim_hil.layouts import LayoutError
+from sim_hil.realtime.stack import INSTRUCTION
 from sim_hil.scene.scene import Scene, load_scene
 from tests.support.train.training_scenarios import SEED, all_scenarios, scenarios
-from tools.demo import INSTRUCTION
 from tools.train.config.collect import CORRIDOR, KINDS, SHARES
 from tools.train.drives.scenarios import (
     FIRST_SEED,
