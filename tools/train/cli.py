@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import signal
 import sys
 import time
@@ -150,8 +151,23 @@ def _train(
 
 
 def _prepare(args: argparse.Namespace, recipe: Recipe, before: Sequence[Step]) -> None:
-    """Write what a run needs before its first step: recipe, delay profile, given drives and given weights."""
+    """Write what a run needs before its first step: recipe, delay profile, given drives and given weights.
+
+    If these are refused, a folder that was new or empty is so again.
+    """
+    is_new, existed = not RunDir(args.out).recipe_path.exists(), args.out.exists()
     run_dir = RunDir.open(args.out, recipe)
+    try:
+        _take_given(args, recipe, before, run_dir)
+    except BaseException:
+        if is_new:
+            shutil.rmtree(args.out, ignore_errors=True)
+            if existed:
+                args.out.mkdir(exist_ok=True)
+        raise
+
+
+def _take_given(args: argparse.Namespace, recipe: Recipe, before: Sequence[Step], run_dir: RunDir) -> None:
     if run_dir.other_code():
         changed = f"{args.out}: was started with other code (versions.json); new drives may differ from its old ones"
         _log(SINGLE, f"{changed}; name another --out to record all of them anew")

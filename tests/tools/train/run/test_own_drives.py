@@ -98,6 +98,22 @@ def test_a_plan_with_their_drives_collects_nothing(theirs: Dataset, capsys: pyte
     assert "sft" in printed and "collect" not in printed
 
 
+@pytest.mark.parametrize("before", ["nothing", "an empty folder", "a run"])
+@pytest.mark.parametrize("given", ["--drives", "--from", "--checkpoint"])
+def test_a_call_whose_given_files_are_refused_leaves_what_it_found(tmp_path: Path, given: str, before: str) -> None:
+    out, damaged = tmp_path / "run", tmp_path / "damaged"
+    damaged.mkdir()
+    (damaged / "dataset.json").write_text("{")
+    (damaged / "model.safetensors").write_bytes(b"no weights")
+    if before == "an empty folder":
+        out.mkdir()
+    elif before == "a run":
+        RunDir.open(out, TINY)
+    found = sorted(tmp_path.rglob("*"))
+    assert cli.main(["sft", "--preset", "tiny", given, str(damaged), "--out", str(out)]) == 2
+    assert sorted(tmp_path.rglob("*")) == found
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
