@@ -41,7 +41,7 @@ def near(name: str, known: typing.Iterable[str]) -> str:
 
 @functools.cache
 def field_types(cls: type) -> Mapping[str, Any]:
-    """Return the type of every field of a dataclass; they are resolved once, which is most of a file's reading."""
+    """Return the type of every field of a dataclass; resolving them takes most of the time of reading a file."""
     hints = typing.get_type_hints(cls)
     return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
 

@@ -6,6 +6,7 @@ import json
 import math
 import random
 import time
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -327,9 +328,9 @@ class Hindered:
     stand_in = False
 
     def __init__(
-        self, times: int, monkeypatch: pytest.MonkeyPatch, start_s: float = 0.0, latency_ms: float | None = 100.0
+        self, times: int, monkeypatch: pytest.MonkeyPatch, start_s: float = 0.0, sample: Sample | None = None
     ) -> None:
-        self.latency_ms = latency_ms
+        self.hindered = sample or Sample(100.0, 0.0, hindered=["did not drive on"])
         self.left, self.start_s, self.now_s, self.injected_s = times, start_s, 0.0, list[float]()
         monkeypatch.setattr(command, "injection", self.injection)
         clock = SimpleNamespace(monotonic_ns=lambda: round(self.now_s * 1e9), sleep=self.sleep)
@@ -344,7 +345,7 @@ class Hindered:
     def injection(self, *_: object) -> Sample:
         self.injected_s.append(self.now_s)
         self.left -= 1
-        return Sample(self.latency_ms, 0.0, hindered=["x"]) if self.left >= 0 else Sample(100.0, 0.0)
+        return deepcopy(self.hindered) if self.left >= 0 else Sample(100.0, 0.0)
 
 
 @pytest.mark.parametrize(("times", "repeated", "passes"), [(0, 0, True), (1, 1, True), (2, 1, False)])
@@ -357,19 +358,22 @@ def test_a_robot_that_does_not_drive_on_fails_a_row_only_twice_in_a_row(
     assert len(result.samples) == 1 + repeated
 
 
-@pytest.mark.parametrize(("times", "samples", "passes"), [(1, [100.0], True), (2, [None], False)])
-def test_a_fault_that_hit_a_robot_that_stood_counts_only_twice_in_a_row(
-    times: int, samples: list[float | None], passes: bool, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("stood", "wrong", "times", "passes"),
+    [(True, [], 1, True), (True, [], 2, False), (True, ["moved"], 1, False), (False, [], 1, False)],
+    ids=["stood once", "stood twice", "stood and moved after it", "no reaction and did not drive on"],
+)
+def test_only_a_fault_that_hit_a_robot_that_stood_is_left_out_and_only_once(
+    stood: bool, wrong: list[str], times: int, passes: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rig = Hindered(times, monkeypatch, latency_ms=None)
+    rig = Hindered(times, monkeypatch, sample=Sample(None, 0.0, wrong, ["x"], stood=stood))
     result = command.run_row(rig, row(), 1, random.Random(0), None)  # type: ignore[arg-type]
-    assert [one.latency_ms for one in result.samples] == samples and result.repeated == 1
-    assert (not result.problems) == passes
+    assert (not result.problems) == passes and result.repeated == 1
 
 
-@pytest.mark.parametrize(("stood_ms", "judged"), [(None, True), (-5, False), (-500, False)])
+@pytest.mark.parametrize(("stood_ms", "judged"), [(None, True), (-0.001, False), (-500, False)])
 def test_an_injection_is_judged_only_if_the_robot_moved_before_it(
-    stood_ms: int | None, judged: bool, monkeypatch: pytest.MonkeyPatch
+    stood_ms: float | None, judged: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     obeys, effects = [(-10_000 * MS, True)], list[int]()
     rig = SimpleNamespace(
@@ -379,13 +383,13 @@ def test_an_injection_is_judged_only_if_the_robot_moved_before_it(
 
     def inject(_: object) -> int:
         effects.append(time.monotonic_ns())
-        obeys.append((effects[0] + (5 if stood_ms is None else stood_ms) * MS, False))
+        obeys.append((effects[0] + round((5 if stood_ms is None else stood_ms) * MS), False))
         return effects[0]
 
     monkeypatch.setattr(measure, "_aftermath", lambda *_: None)
     one = Row("test", None, inject, judge=Judge.ROBOT, bound=10.0)
     sample = measure.injection(rig, one, random.Random(0), SimpleNamespace(between_ns=lambda *_: 0))  # type: ignore[arg-type]
-    assert (sample.latency_ms == 5.0) == judged and (sample.hindered == []) == judged
+    assert (sample.latency_ms == 5.0) == judged and (sample.hindered == []) == judged and sample.stood != judged
 
 
 def test_the_pause_of_a_row_is_between_two_injections_however_long_the_runner_takes_to_start(

@@ -136,8 +136,8 @@ def run_row(
         _show(row, f"{index + 1}/{times}", sample)
         if sample.hindered:
             repeated += 1
-            if row.judged_by is not Judge.UNCHANGED and sample.latency_ms is not None:
-                samples.append(sample)  # the robot stopped as required
+            if row.judged_by is not Judge.UNCHANGED and (sample.wrong or not sample.stood):
+                samples.append(sample)  # the robot stopped as required, or did what it must not
             sample = attempt(rig, row, rng, host)
             _show(row, f"{index + 1}/{times} again", sample)
             sample.wrong += sample.hindered

@@ -39,7 +39,7 @@ _ANY = float("inf")
 
 @dataclass
 class Sample:
-    """Result of one injection; `latency_ms` is None if the expected reaction did not come in time."""
+    """Result of one injection; `latency_ms` is None if the expected reaction did not come in time, or if `stood`."""
 
     latency_ms: float | None
     stall_ms: float
@@ -47,9 +47,11 @@ class Sample:
     wrong: list[str] = field(default_factory=list)
     """Other failures."""
     hindered: list[str] = field(default_factory=list)
-    """Reason why the robot did not drive although permitted; a busy machine can cause it, so it is repeated."""
+    """Reason why the robot did not drive before or after the fault; a busy machine can cause it, so it is repeated."""
     ended: bool = False
     """Whether a run that may end or go on has ended."""
+    stood: bool = False
+    """Whether the robot stood before the fault."""
 
 
 def injection(rig: Rig, row: Row, rng: random.Random, host: HostStall) -> Sample:
@@ -66,9 +68,9 @@ def injection(rig: Rig, row: Row, rng: random.Random, host: HostStall) -> Sample
         sample = _fresh(rig, effect_ns, host)
     else:
         sample = _awaited(rig, row, effect_ns, commanders, host)
-    if not moving_at(rig.robot_obeys_motion(), before_ns):
-        # The fault hit a robot that stood: neither a late reaction nor one in time.
-        sample.latency_ms = None
+    # Only the robot's own reaction cannot precede the effect.
+    if not moving_at(rig.robot_obeys_motion(), effect_ns if row.judged_by is Judge.ROBOT else before_ns):
+        sample.stood, sample.latency_ms = True, None  # neither a late reaction nor one in time
         sample.hindered.append("the robot stood before the fault")
     _aftermath(rig, row, sample, commanders)
     return sample

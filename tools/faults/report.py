@@ -43,7 +43,7 @@ class RowResult:
 
     A bound holds if the 99.9th percentile is within it, no sample exceeds twice the bound, every sample has a reaction
     and there is no other problem. On a quiet machine, its stalls are subtracted and counted. An injection is
-    `repeated` and counted if the robot did not drive although permitted.
+    `repeated` and counted if the robot stood before the fault, or did not drive on after it.
     """
 
     row: Row

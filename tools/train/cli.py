@@ -153,7 +153,7 @@ def _train(
 def _prepare(args: argparse.Namespace, recipe: Recipe, before: Sequence[Step]) -> None:
     """Write what a run needs before its first step: recipe, delay profile, given drives and given weights.
 
-    If these are refused, a folder that was new or empty is so again.
+    If one is refused, what this call wrote into a new or empty folder is removed.
     """
     is_new, existed = not RunDir(args.out).recipe_path.exists(), args.out.exists()
     run_dir = RunDir.open(args.out, recipe)
@@ -161,9 +161,13 @@ def _prepare(args: argparse.Namespace, recipe: Recipe, before: Sequence[Step]) -
         _take_given(args, recipe, before, run_dir)
     except BaseException:
         if is_new:
-            shutil.rmtree(args.out, ignore_errors=True)
-            if existed:
-                args.out.mkdir(exist_ok=True)
+            for entry in list(args.out.iterdir()):
+                if entry.is_dir() and not entry.is_symlink():
+                    shutil.rmtree(entry, ignore_errors=True)
+                else:
+                    entry.unlink()
+            if not existed:
+                args.out.rmdir()
         raise
 
 

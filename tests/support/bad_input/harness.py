@@ -132,7 +132,12 @@ class Servers:
         assert server.stdin is not None and server.stdout is not None
         server.stdin.write(json.dumps({"module": module, "function": function, "cases": sent}) + "\n")
         server.stdin.flush()
-        return [json.loads(server.stdout.readline()) for _ in sent]
+        try:
+            return [json.loads(server.stdout.readline()) for _ in sent]
+        except BaseException:  # also a test's time limit: its answers are not those of the next command
+            server.kill()
+            del self._started[module]
+            raise
 
 
 def run(command: Command, folder: Path, chosen: Sequence[Case], servers: Servers) -> list[Answer]:

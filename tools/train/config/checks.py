@@ -78,7 +78,7 @@ class Checked:
     """A configuration whose numbers lie within the ranges of their types. Raises ValueError when it is built."""
 
     def __post_init__(self) -> None:
-        for name, allowed in ranges_of(type(self)).items():  # type: ignore[arg-type]  # as in `build`
+        for name, allowed in ranges_of(type(self)).items():  # type: ignore[arg-type]  # as in `typed.build`
             if (value := getattr(self, name)) not in allowed:
                 raise ValueError(f"{name}: expected {allowed}, found {value:g}")
 

@@ -109,6 +109,9 @@ def test_a_call_whose_given_files_are_refused_leaves_what_it_found(tmp_path: Pat
         out.mkdir()
     elif before == "a run":
         RunDir.open(out, TINY)
+    if given == "--from":
+        RunDir.open(damaged / "run", TINY)  # none of its stages has finished
+        damaged /= "run"
     found = sorted(tmp_path.rglob("*"))
     assert cli.main(["sft", "--preset", "tiny", given, str(damaged), "--out", str(out)]) == 2
     assert sorted(tmp_path.rglob("*")) == found
