@@ -9,7 +9,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from types import FrameType
 from typing import Any, Final
@@ -160,10 +160,10 @@ def _prepare(args: argparse.Namespace, recipe: Recipe, before: Sequence[Step]) -
     try:
         _take_given(args, recipe, before, run_dir)
     except BaseException:
-        if is_new:
-            for entry in list(args.out.iterdir()):
+        with suppress(OSError):  # the reason of the refusal is what the user must see
+            for entry in list(args.out.iterdir()) if is_new else ():
                 if entry.is_dir() and not entry.is_symlink():
-                    shutil.rmtree(entry, ignore_errors=True)
+                    shutil.rmtree(entry)
                 else:
                     entry.unlink()
             if not existed:
