@@ -110,15 +110,16 @@ def deterministic(device: str) -> Iterator[None]:
     import torch
 
     deterministic: Any = torch.utils.deterministic  # torch defines its attributes at run time
-    before = torch.are_deterministic_algorithms_enabled(), deterministic.fill_uninitialized_memory
+    before = torch.get_deterministic_debug_mode(), deterministic.fill_uninitialized_memory
     if device == "cpu":
-        torch.use_deterministic_algorithms(True)
+        # The same as use_deterministic_algorithms(True), which also loads torch's compiler: a second for nothing.
+        torch.set_deterministic_debug_mode("error")
         # No code reads memory before writing it; filling it only costs time.
         deterministic.fill_uninitialized_memory = False
     try:
         yield
     finally:
-        torch.use_deterministic_algorithms(before[0])
+        torch.set_deterministic_debug_mode(before[0])
         deterministic.fill_uninitialized_memory = before[1]
 
 

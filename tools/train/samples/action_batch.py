@@ -194,10 +194,14 @@ def _layer(
     q = layer.q(layer.norm1(x)).unflatten(-1, (heads, width)).transpose(1, 2) * width**-0.5
     q_shared = _shared(q, share)
     scores_now = _shared(q @ now[0].transpose(2, 3), share)
-    scores = (q_shared @ semantic[0].transpose(2, 3)).masked_fill(~real[:, None, None], float("-inf"))
-    weights = torch.softmax(torch.cat([scores_now, scores], dim=-1).float(), dim=-1).to(q.dtype)
-    seen = _own(weights[..., :-tokens], share) @ now[1]
-    meant = _own(weights[..., -tokens:] @ semantic[1], share)
+    # Adding in place needs no other pass when gradients are computed; masked_fill does.
+    padding = torch.zeros_like(real, dtype=q.dtype).masked_fill_(~real, float("-inf"))[:, None, None]
+    scores = (q_shared @ semantic[0].transpose(2, 3)).add_(padding)
+    # Of bfloat16 scores, too, softmax computes in float32.
+    weights = torch.softmax(torch.cat([scores_now, scores], dim=-1), dim=-1).to(q.dtype)
+    at_now, at_semantic = weights.split([now[0].shape[2], tokens], dim=-1)
+    seen = _own(at_now, share) @ now[1]
+    meant = _own(at_semantic @ semantic[1], share)
     attended = (seen + meant).transpose(1, 2).reshape(batch, steps, heads * width)
     x = x + layer.o(attended)
     out: Tensor = x + layer.fc2(F.gelu(layer.fc1(layer.norm2(x))))

@@ -32,9 +32,9 @@ def as_on_the_command_line() -> Iterator[None]:
     """`edge-train` asks torch for deterministic algorithms: one that is not would raise. Tiny layers: one thread."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    torch.use_deterministic_algorithms(True)
+    torch.set_deterministic_debug_mode("error")
     yield
-    torch.use_deterministic_algorithms(False)
+    torch.set_deterministic_debug_mode("default")
     torch.set_num_threads(threads)
 
 
