@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Final, TypeAlias
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 - torch's own idiom
@@ -28,6 +31,11 @@ def fold_tokens(tokens: Tensor, side: int) -> Tensor:
     return folded.reshape(n, (grid // side) ** 2, c * side * side)
 
 
+Attention: TypeAlias = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""Queries, keys and values [n, heads, t, d] to the attended values [n, heads, t, d]."""
+ATTENTION: Final[Attention] = F.scaled_dot_product_attention
+
+
 class VisionBlock(nn.Module):
     """Pre-norm attention and MLP with LayerScale."""
 
@@ -43,10 +51,10 @@ class VisionBlock(nn.Module):
         self.fc2 = nn.Linear(config.mlp, config.hidden)
         self.ls2 = nn.Parameter(torch.full((config.hidden,), config.layer_scale_init))
 
-    def forward(self, x: Tensor) -> Tensor:
+    def forward(self, x: Tensor, attention: Attention = ATTENTION) -> Tensor:
         n, t, d = x.shape
         qkv: Tensor = self.qkv(self.norm1(x)).reshape(n, t, 3, self.heads, d // self.heads).permute(2, 0, 3, 1, 4)
-        attended = F.scaled_dot_product_attention(qkv[0], qkv[1], qkv[2])
+        attended = attention(qkv[0], qkv[1], qkv[2])
         x = x + self.ls1 * self.proj(attended.transpose(1, 2).reshape(n, t, d))
         out: Tensor = x + self.ls2 * self.fc2(F.gelu(self.fc1(self.norm2(x))))
         return out
@@ -83,12 +91,12 @@ class VisionEncoder(nn.Module):
             nn.Linear(config.token_dim, config.token_dim),
         )
 
-    def forward(self, frame: Tensor) -> Tensor:
+    def forward(self, frame: Tensor, attention: Attention = ATTENTION) -> Tensor:
         pixels = (frame.float() - self.mean) * self.inv_std
         x = self.embed(pixels.permute(0, 3, 1, 2)).flatten(2).transpose(1, 2)
         x = torch.cat([self.cls.expand(x.shape[0], -1, -1), x], dim=1) + self.position
         for block in self.blocks:
-            x = block(x)
+            x = block(x, attention)
         # No CLS token and no final norm, like the input of InternVL's projector.
         tokens: Tensor = self.projector(fold_tokens(x[:, 1:], self.config.pixel_shuffle))
         return tokens

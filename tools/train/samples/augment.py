@@ -60,7 +60,7 @@ def decoded(data: NDArray[np.uint8]) -> Picture:
     picture = cv2.imdecode(data, cv2.IMREAD_COLOR)
     if picture is None:
         raise ValueError(f"expected a JPEG, found {len(data)} other bytes")
-    return np.ascontiguousarray(picture[..., ::-1])
+    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def through_jpeg(picture: Picture, quality: int) -> Picture:

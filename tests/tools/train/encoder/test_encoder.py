@@ -16,7 +16,7 @@ from tests.support.train.train_encoder_rank import CONFIG, encoder_job
 from tests.support.train.train_stage_contract import Run, StageContract
 from tools.train.config.checks import OptimConfig, TrainError
 from tools.train.config.encoder import EncoderConfig, FramesConfig
-from tools.train.encoder.encoder import run
+from tools.train.encoder.encoder import plain_attention, run
 from tools.train.samples.tokens import encoder_sha256
 
 STEPS = 8
@@ -67,6 +67,11 @@ class TestStage(StageContract):
 
     def train(self, out: Path, config: EncoderConfig | None = None, **options: Any) -> Run:
         return trained(out, config=config or CONFIG, **options)
+
+
+def test_plain_attention_is_attention() -> None:
+    q, k, v = torch.randn(3, 2, 3, 5, 4, generator=torch.Generator().manual_seed(1))
+    torch.testing.assert_close(plain_attention(q, k, v), torch.nn.functional.scaled_dot_product_attention(q, k, v))
 
 
 def test_without_pictures_the_encoder_stays_as_it_is(tmp_path: Path) -> None:
