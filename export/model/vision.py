@@ -12,6 +12,11 @@ from torch.nn import functional as F  # noqa: N812 - torch's own idiom
 from export.model.attention import TypedModuleList
 from export.model.config import VisionConfig
 
+Attention: TypeAlias = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""Queries, keys and values [n, heads, t, d] to the attended values [n, heads, t, d]."""
+TORCH_ATTENTION: Final[Attention] = F.scaled_dot_product_attention
+"""That of the exported graphs."""
+
 
 def pixel_shuffle_v2(x: Tensor, side: int) -> Tensor:
     """Fold each side×side square of a [n, w, h, c] map into one cell of side²·c channels (InternVL's `v2` order)."""
@@ -31,11 +36,6 @@ def fold_tokens(tokens: Tensor, side: int) -> Tensor:
     return folded.reshape(n, (grid // side) ** 2, c * side * side)
 
 
-Attention: TypeAlias = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""Queries, keys and values [n, heads, t, d] to the attended values [n, heads, t, d]."""
-ATTENTION: Final[Attention] = F.scaled_dot_product_attention
-
-
 class VisionBlock(nn.Module):
     """Pre-norm attention and MLP with LayerScale."""
 
@@ -51,7 +51,7 @@ class VisionBlock(nn.Module):
         self.fc2 = nn.Linear(config.mlp, config.hidden)
         self.ls2 = nn.Parameter(torch.full((config.hidden,), config.layer_scale_init))
 
-    def forward(self, x: Tensor, attention: Attention = ATTENTION) -> Tensor:
+    def forward(self, x: Tensor, attention: Attention = TORCH_ATTENTION) -> Tensor:
         n, t, d = x.shape
         qkv: Tensor = self.qkv(self.norm1(x)).reshape(n, t, 3, self.heads, d // self.heads).permute(2, 0, 3, 1, 4)
         attended = attention(qkv[0], qkv[1], qkv[2])
@@ -91,7 +91,7 @@ class VisionEncoder(nn.Module):
             nn.Linear(config.token_dim, config.token_dim),
         )
 
-    def forward(self, frame: Tensor, attention: Attention = ATTENTION) -> Tensor:
+    def forward(self, frame: Tensor, attention: Attention = TORCH_ATTENTION) -> Tensor:
         pixels = (frame.float() - self.mean) * self.inv_std
         x = self.embed(pixels.permute(0, 3, 1, 2)).flatten(2).transpose(1, 2)
         x = torch.cat([self.cls.expand(x.shape[0], -1, -1), x], dim=1) + self.position

@@ -112,7 +112,7 @@ def deterministic(device: str) -> Iterator[None]:
     deterministic: Any = torch.utils.deterministic  # torch defines its attributes at run time
     before = torch.get_deterministic_debug_mode(), deterministic.fill_uninitialized_memory
     if device == "cpu":
-        # The same as use_deterministic_algorithms(True), which also loads torch's compiler: a second for nothing.
+        # As use_deterministic_algorithms(True), which would also load torch's compiler (a second).
         torch.set_deterministic_debug_mode("error")
         # No code reads memory before writing it; filling it only costs time.
         deterministic.fill_uninitialized_memory = False

@@ -74,11 +74,17 @@ def test_another_version_of_a_package_or_of_our_code_names_another_stage(
     assert stage_key("graph", {}, CODE) != before
 
 
+def forget() -> None:
+    """Empty the memory of sources, as in a new process."""
+    stages.source_sha256.cache_clear()
+    stages._imports.cache_clear()
+
+
 @pytest.fixture
 def sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A tree of ours in small: a imports b.c inside a function, d is nobody's."""
     for name, text in {
-        "export/a.py": "def f():\n    from edge.b import c\n",
+        "export/a.py": "try:\n    def f():\n        from edge.b import c\nfinally:\n    pass\n",
         "edge/b/__init__.py": "",
         "edge/b/c.py": "import numpy\n",
         "edge/b/numbers.json": "{}",
@@ -89,9 +95,9 @@ def sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
     monkeypatch.setattr(stages, "__file__", str(tmp_path / "root" / "export" / "core" / "cache.py"))
-    stages.source_sha256.cache_clear()
+    forget()
     yield tmp_path / "root"
-    stages.source_sha256.cache_clear()
+    forget()
 
 
 @pytest.mark.parametrize(
@@ -108,7 +114,7 @@ def sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 def test_an_edit_counts_where_the_stages_code_can_reach_it(sources: Path, edited: str, counts: bool) -> None:
     before = stages.source_sha256(("export.a",))
     (sources / edited).write_text((sources / edited).read_text() + " ")
-    stages.source_sha256.cache_clear()
+    forget()
     assert (stages.source_sha256(("export.a",)) != before) is counts
 
 

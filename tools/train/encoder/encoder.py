@@ -21,7 +21,7 @@ from torch import Tensor
 
 from edge.state.frame import fit_frame
 from export.model.network import TicVla
-from export.model.vision import ATTENTION
+from export.model.vision import TORCH_ATTENTION
 from tools.train.config.checks import TrainError
 from tools.train.config.encoder import EncoderConfig
 from tools.train.encoder.data import FrameSet, fill, frames_sha256, plan
@@ -32,6 +32,7 @@ from tools.train.run.job import StageJob
 from tools.train.run.loop import Ahead, Optimiser, TrainingLoop
 from tools.train.run.network_file import finish_network, start_network
 from tools.train.samples.augment import augmented
+from tools.train.samples.language_batch import PLAIN_TOKENS
 from tools.train.samples.tokens import encoder_sha256
 
 STAGE: Final = "encoder"
@@ -86,10 +87,13 @@ def token_side(network: TicVla) -> int:
 
 
 def plain_attention(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-    """Compute attention [n, heads, t, d] with plain products.
+    """Compute attention [n, heads, t, d], with plain products for few tokens.
 
-    For an image's few tokens on a CPU, they take a fifth of the time of torch's attention, forward and backward.
+    For nano's 65 tokens on a CPU, these take a fifth of the time of torch's attention, with gradients. The rounding
+    error of bfloat16 gradients is 0.8 instead of 0.3 %.
     """
+    if q.shape[-2] > PLAIN_TOKENS:
+        return TORCH_ATTENTION(q, k, v)
     weights: Tensor = ((q * q.shape[-1] ** -0.5) @ k.transpose(-1, -2)).softmax(-1)
     return weights.to(v.dtype) @ v
 
@@ -156,7 +160,7 @@ class _Trainer:
 
     def _losses(self, batch: _Batch) -> Tensor:
         device = self._job.device
-        attention = plain_attention if device == "cpu" else ATTENTION
+        attention = plain_attention if device == "cpu" else TORCH_ATTENTION
         with autocast(device, self._config.optim.bf16):
             predicted = self._heads(self._network.vision(torch.from_numpy(batch.pictures).to(device), attention))
         return total(losses(predicted, as_tensors(batch.labels, device), self._balance))

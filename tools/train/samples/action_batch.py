@@ -194,10 +194,10 @@ def _layer(
     q = layer.q(layer.norm1(x)).unflatten(-1, (heads, width)).transpose(1, 2) * width**-0.5
     q_shared = _shared(q, share)
     scores_now = _shared(q @ now[0].transpose(2, 3), share)
-    # Adding in place needs no other pass when gradients are computed; masked_fill does.
+    # The backward pass of an addition copies nothing; that of masked_fill makes another pass.
     padding = torch.zeros_like(real, dtype=q.dtype).masked_fill_(~real, float("-inf"))[:, None, None]
     scores = (q_shared @ semantic[0].transpose(2, 3)).add_(padding)
-    # Of bfloat16 scores, too, softmax computes in float32.
+    # Inside, softmax computes in float32 also for bfloat16 scores.
     weights = torch.softmax(torch.cat([scores_now, scores], dim=-1), dim=-1).to(q.dtype)
     at_now, at_semantic = weights.split([now[0].shape[2], tokens], dim=-1)
     seen = _own(at_now, share) @ now[1]

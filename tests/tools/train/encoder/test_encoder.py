@@ -11,6 +11,7 @@ import torch
 from safetensors.torch import load_file
 
 from export.model.network import build
+from export.model.vision import TORCH_ATTENTION
 from tests.support.train.train_drives import tiny_model
 from tests.support.train.train_encoder_rank import CONFIG, encoder_job
 from tests.support.train.train_stage_contract import Run, StageContract
@@ -69,9 +70,17 @@ class TestStage(StageContract):
         return trained(out, config=config or CONFIG, **options)
 
 
-def test_plain_attention_is_attention() -> None:
-    q, k, v = torch.randn(3, 2, 3, 5, 4, generator=torch.Generator().manual_seed(1))
-    torch.testing.assert_close(plain_attention(q, k, v), torch.nn.functional.scaled_dot_product_attention(q, k, v))
+def test_tokens_and_gradients_are_those_of_torchs_own_attention() -> None:
+    vision = build(tiny_model(), 1).vision
+    px = vision.config.image_px
+    pictures = torch.randint(0, 256, (3, px, px, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
+    found: list[list[torch.Tensor]] = []
+    for attention in (plain_attention, TORCH_ATTENTION):
+        vision.zero_grad()
+        tokens = vision(pictures, attention)
+        tokens.square().mean().backward()
+        found.append([tokens.detach(), *(weight.grad.clone() for weight in vision.parameters())])
+    torch.testing.assert_close(found[0], found[1], atol=1e-5, rtol=1e-3)
 
 
 def test_without_pictures_the_encoder_stays_as_it_is(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from safetensors import SafetensorError
 
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 from export.model.config import PRESETS
+from tools.train import cli
 from tools.train.config.checks import OptimConfig, TrainError
 from tools.train.config.recipe import load_recipe
 from tools.train.run import loop
@@ -257,6 +258,15 @@ def test_a_processor_computes_in_bfloat16_only_with_instructions_for_it(
         assert computes_bf16("cuda")
     finally:
         computes_bf16.cache_clear()
+
+
+@pytest.mark.parametrize(("device", "inside"), [("cpu", "error"), ("cuda", "default")])
+def test_operations_are_deterministic_on_the_cpu_until_the_command_ends(device: str, inside: str) -> None:
+    modes = {"default": 0, "error": 2}
+    with pytest.raises(KeyboardInterrupt), cli.deterministic(device):
+        assert torch.get_deterministic_debug_mode() == modes[inside]
+        raise KeyboardInterrupt
+    assert torch.get_deterministic_debug_mode() == modes["default"]
 
 
 def test_a_step_that_is_not_finite_changes_nothing_and_is_counted() -> None:

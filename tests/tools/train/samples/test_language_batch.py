@@ -13,6 +13,7 @@ from edge.reasoning.line_constraint import LineConstraint
 from export.model.config import PRESETS, TicVlaConfig
 from export.model.language import LanguageModel
 from export.model.network import build
+from tools.train.samples import language_batch
 from tools.train.samples.language_batch import Row, collate, decode, row_losses, run
 
 IMAGE = 5
@@ -36,6 +37,13 @@ def language() -> LanguageModel:
     return build(tiny(), 3).language
 
 
+@pytest.fixture(params=["plain", "torch"])
+def attention(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Plain products, or torch's attention as on a GPU and for long rows."""
+    if request.param == "torch":
+        monkeypatch.setattr(language_batch, "PLAIN_TOKENS", 0)
+
+
 def row(seed: int, frames: int, text: int, answer: int) -> Row:
     rng = np.random.default_rng(seed)
     prompt: list[int] = []
@@ -57,6 +65,7 @@ def alone(language: LanguageModel, one: Row, upto: int) -> tuple[torch.Tensor, t
     return logits[-1], kv[0]
 
 
+@pytest.mark.usefixtures("attention")
 def test_keys_values_and_scores_of_every_row_are_those_of_the_row_alone(language: LanguageModel) -> None:
     batch = collate(ROWS, img_context_id=IMAGE, device=DEVICE)
     with torch.no_grad():
@@ -82,6 +91,16 @@ def test_the_loss_of_a_row_is_the_mean_over_its_answer_whatever_stands_beside_it
     assert together[3].item() == 0.0
 
 
+def test_gradients_are_those_of_torchs_own_attention(language: LanguageModel, monkeypatch: pytest.MonkeyPatch) -> None:
+    found: list[list[torch.Tensor]] = []
+    for longest in (language_batch.PLAIN_TOKENS, 0):
+        monkeypatch.setattr(language_batch, "PLAIN_TOKENS", longest)
+        language.zero_grad()
+        row_losses(language, collate(ROWS, img_context_id=IMAGE, device=DEVICE)).sum().backward()
+        found.append([weight.grad.clone() for weight in language.parameters() if weight.grad is not None])
+    torch.testing.assert_close(found[0], found[1], atol=1e-6, rtol=1e-3)
+
+
 def test_gradients_reach_the_merge_layer_through_the_answers_alone(language: LanguageModel) -> None:
     silent = [dataclasses.replace(one, answer=()) for one in ROWS]
     for rows, learns in ((ROWS, True), (silent, False)):
@@ -92,6 +111,7 @@ def test_gradients_reach_the_merge_layer_through_the_answers_alone(language: Lan
     language.zero_grad()
 
 
+@pytest.mark.usefixtures("attention")
 @pytest.mark.parametrize("most", [0, 1, 6])
 def test_greedy_answers_of_a_batch_are_those_of_every_row_alone(language: LanguageModel, most: int) -> None:
     silent = [dataclasses.replace(one, answer=()) for one in ROWS]
