@@ -118,7 +118,7 @@ def messages(job: Message) -> Iterator[Mapping[str, Any]]:
 
 def _of_layout(order: Order, numbers: range, size: int) -> Iterator[Mapping[str, Any]]:
     """Record some of the `size` drives of one layout; yield the messages of each."""
-    kinds = order.config.kinds or SHARES
+    kinds = (order.tour.kinds if order.tour is not None else {}) or order.config.kinds or SHARES
     turned_share = (order.tour or order.config).turned_share
     try:
         scenarios = list(

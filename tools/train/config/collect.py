@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from math import inf
 from types import MappingProxyType
 from typing import Annotated, Final
 
@@ -18,6 +19,15 @@ SHARES: Final[Mapping[str, float]] = MappingProxyType(
     {"hospital": 0.25, "office": 0.25, "warehouse": 0.24, "sidewalk": 0.20, CORRIDOR: 0.06}
 )
 """Default shares of the kinds of scenes."""
+
+
+def check_shares(kinds: Mapping[str, float]) -> None:
+    """Raise ValueError unless `kinds` are shares of known kinds of scenes, of which one is positive, or empty."""
+    if unknown := sorted(set(kinds) - set(KINDS)):
+        raise ValueError(f"kinds: expected some of {', '.join(KINDS)}, found {unknown[0]}")
+    if kinds and not (all(0 <= share < inf for share in kinds.values()) and any(kinds.values())):
+        raise ValueError(f"kinds: expected shares of 0 or more, one of them positive, found {dict(kinds)}")
+
 
 RATE_HZ: Final = 10
 """Frames per second of a recorded drive."""
@@ -71,6 +81,7 @@ class CollectConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_shares(self.kinds)
         if self.typical_drift_share + self.severe_drift_share > 1:
             raise ValueError("expected shares of the drifts with a sum up to 1")
         if self.jpeg_quality_min > self.jpeg_quality_max:
@@ -88,6 +99,8 @@ class TourConfig(Checked):
     count: Annotated[int, Range(0, 1_000_000)] = 0
     """Number of tours; 0: none."""
     per_layout: Annotated[int, Range(1, 100)] = 8
+    kinds: Mapping[str, float] = field(default_factory=dict)
+    """Shares of the kinds of scenes; empty: those of the drives."""
     people_most: Annotated[int, Range(0, 200)] = 20
     """Upper limit of people in a scene: more would occlude the described objects and slow the simulation."""
     stray_share: Share = 0.35
@@ -100,6 +113,10 @@ class TourConfig(Checked):
     """Tours that begin with a random heading and not along the route; the instruction says how to turn."""
     linger_s: Annotated[float, Range(0, 60)] = 5.0
     """Longest recording after arrival, s; each tour takes between half of it and all of it."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_shares(self.kinds)
 
 
 @dataclass(frozen=True)

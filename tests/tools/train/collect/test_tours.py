@@ -118,6 +118,19 @@ def test_other_numbers_make_other_tours_and_more_of_them_the_same(tmp_path: Path
 
 
 @pytest.mark.slow
+def test_its_kinds_of_scenes_are_those_of_the_drives_or_its_own(tmp_path: Path) -> None:
+    dataset = write_dataset(tmp_path, [made_up_drive("a", 40)])
+    config = CollectConfig(kinds={"warehouse": 1.0}, jobs=1)
+
+    def kind_of(**kinds: float) -> str:
+        numbers = TourConfig(count=1, per_layout=1, people_most=0, kinds=kinds)
+        (entry,) = build_tours(dataset, numbers, config, 3, ranks=SINGLE, progress=QuietProgress()).entries
+        return entry.kind
+
+    assert (kind_of(), kind_of(corridor=1.0)) == ("warehouse", "corridor")
+
+
+@pytest.mark.slow
 def test_a_layout_that_is_held_out_is_shown_by_no_tour(tmp_path: Path) -> None:
     config = CollectConfig(kinds={"warehouse": 1.0}, jobs=1)
     numbers = TourConfig(count=1, per_layout=1, people_most=0)

@@ -143,6 +143,8 @@ def test_numbers_outside_their_range_are_refused_by_name(kind: type) -> None:
     [
         (collect.CollectConfig, {"typical_drift_share": 0.7, "severe_drift_share": 0.4}, "shares"),
         (collect.CollectConfig, {"jpeg_quality_min": 96}, "jpeg_quality"),
+        (collect.CollectConfig, {"kinds": {"castle": 1.0}}, "castle"),
+        (collect.TourConfig, {"kinds": {"office": 0.0}}, "one of them positive"),
         (encoder.FramesConfig, {"kinds": ("castle",)}, "kinds"),
         (encoder.FramesConfig, {"kinds": ("corridor",)}, "held"),
         (encoder.FramesConfig, {"count": 60_000, "per_scene": 1}, "scenes"),
