@@ -22,10 +22,10 @@ SHARES: Final[Mapping[str, float]] = MappingProxyType(
 
 
 def check_shares(kinds: Mapping[str, float]) -> None:
-    """Raise ValueError unless `kinds` are shares of known kinds of scenes, of which one is positive, or empty."""
+    """Raise ValueError unless `kinds` are shares of known kinds of scenes, of which one is positive."""
     if unknown := sorted(set(kinds) - set(KINDS)):
         raise ValueError(f"kinds: expected some of {', '.join(KINDS)}, found {unknown[0]}")
-    if kinds and not (all(0 <= share < inf for share in kinds.values()) and any(kinds.values())):
+    if not all(0 <= share < inf for share in kinds.values()) or not any(kinds.values()):
         raise ValueError(f"kinds: expected shares of 0 or more, one of them positive, found {dict(kinds)}")
 
 
@@ -81,7 +81,8 @@ class CollectConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_shares(self.kinds)
+        if self.kinds:
+            check_shares(self.kinds)
         if self.typical_drift_share + self.severe_drift_share > 1:
             raise ValueError("expected shares of the drifts with a sum up to 1")
         if self.jpeg_quality_min > self.jpeg_quality_max:
@@ -116,7 +117,8 @@ class TourConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_shares(self.kinds)
+        if self.kinds:
+            check_shares(self.kinds)
 
 
 @dataclass(frozen=True)

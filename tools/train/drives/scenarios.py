@@ -27,7 +27,7 @@ from sim_hil.benchmark.suite.robots import robot_grid, route_grid
 from sim_hil.layouts import RESERVED_BELOW, LayoutError, generate, is_reserved
 from sim_hil.scene.nav_grid import NavGrid
 from sim_hil.scene.scene import Area, Scene, SceneObject, load_scene
-from tools.train.config.collect import CORRIDOR, KINDS, OUTDOORS, SHARES, TASKS_PER_SCENE
+from tools.train.config.collect import CORRIDOR, KINDS, OUTDOORS, SHARES, TASKS_PER_SCENE, check_shares
 
 # Objects of the demo's corridor that are distinguishable and can be goals.
 _CORRIDOR_LANDMARKS: Final = frozenset(
@@ -231,10 +231,10 @@ def training_episodes(
 
 def kind_of_group(seed: int, group: int, kinds: Mapping[str, float]) -> str:
     """Return the kind of a group's layout, distributed by the given shares. Raises ScenarioError."""
-    if unknown := sorted(set(kinds) - set(KINDS)):
-        raise ScenarioError(f"unknown kind of scene {unknown[0]!r}, expected of {', '.join(KINDS)}")
-    if not all(isfinite(share) and share >= 0 for share in kinds.values()) or sum(kinds.values()) <= 0:
-        raise ScenarioError(f"expected shares of kinds of 0 or more with a positive sum, found {dict(kinds)}")
+    try:
+        check_shares(kinds)
+    except ValueError as error:
+        raise ScenarioError(str(error)) from error
     names = [name for name in KINDS if kinds.get(name, 0) > 0]
     # A low-discrepancy sequence (golden ratio) and not random numbers: short runs have the right shares too.
     place = (0.5 + 0.618033988749895 * group + 0.37 * seed) % 1.0
