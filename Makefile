@@ -17,18 +17,14 @@ PARALLEL := $(SINGLE) -n $(WORKERS) --dist loadfile
 PROCESS_FILES = $(shell grep -rlF --include='test_*.py' mark.process tests)
 PROPERTY_FILES = $(shell grep -rlE --include='test_*.py' 'given|stateful' tests)
 # Tests of processes mostly wait, so isolated ones run beside them, with the lowest priority. They share a folder, so that
-# the model is exported once: EDGE_TEST_FOLDER, or one of their own. $(1): the tests' name, $(2): options, $(3): marker,
-# $(4): the file that holds all but one of the isolated tests' workers as long as it exists.
+# the model is exported once: EDGE_TEST_FOLDER, or one of their own. $(1): the tests' name, $(2): options, $(3): marker.
 tiers = @own=; test -n "$$EDGE_TEST_FOLDER" || own=$$(mktemp -d) && folder=$${EDGE_TEST_FOLDER:-$$own} && \
-	export EDGE_TEST_FOLDER="$$folder" && $(if $(4),touch "$$folder/$(4)" &&) \
-	trap 'kill $$isolated 2>/dev/null; wait $$isolated; rm -rf $$own "$$folder/one-worker"' EXIT && trap 'exit 130' INT TERM && \
+	export EDGE_TEST_FOLDER="$$folder" && \
+	trap 'kill $$isolated 2>/dev/null; wait $$isolated; rm -rf $$own' EXIT && trap 'exit 130' INT TERM && \
 	{ nice -n 19 env $(PARALLEL) $(2) -m "$(3)not process" > "$$folder/isolated.log" 2>&1 & } && isolated=$$!; \
 	echo "== $(1) tests of processes, one at a time" && \
-	{ $(PYTEST) $(2) -m "$(3)process and not repeated" $(PROCESS_FILES); processes=$$?; rm -f "$$folder/one-worker"; } ; \
-	wait $$isolated; code=$$?; isolated=; \
+	$(PYTEST) $(2) -m "$(3)process and not repeated" $(PROCESS_FILES); processes=$$?; wait $$isolated; code=$$?; isolated=; \
 	echo "== isolated $(1) tests" && cat "$$folder/isolated.log" && test $$processes = 0 && test $$code = 0
-# Slow tests of processes drive robots in real time: they leave one core to a single worker of the others.
-slow_tiers = $(call tiers,$(1),--durations=15,$(2),one-worker)
 # Tests start hundreds of processes; without compiled modules on the disk each would compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
@@ -111,16 +107,16 @@ test: lint
 	$(call tiers,fast,,not slow and )
 
 test-slow: .venv/.test-installed
-	$(call slow_tiers,slow,slow and )
+	$(call tiers,slow,--durations=15,slow and )
 
 # Shrinking a failing example takes up to 5 minutes: longer than the usual time limit of a test.
 test-random: .venv/.test-installed
-	@rm -f "$${EDGE_TEST_FOLDER:-.}/one-worker"; seed=$(SEED); test "$$seed" -ne 0 || seed=$$($(PYTHON) -c "import secrets; print(1 + secrets.randbelow(2**31))"); \
+	@seed=$(SEED); test "$$seed" -ne 0 || seed=$$($(PYTHON) -c "import secrets; print(1 + secrets.randbelow(2**31))"); \
 	echo "== property tests with the random seed $$seed; repeat them with: make test-random SEED=$$seed"; \
 	$(PARALLEL) $(PROPERTY_FILES) -m "hypothesis and not process" --timeout 600 --hypothesis-profile=random --hypothesis-seed=$$seed
 
 test-all: lint
-	$(call slow_tiers,all,)
+	$(call tiers,all,--durations=15,)
 
 stops: .venv/.test-installed
 	$(PYTEST) -s -m repeated tests/process/bridge

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-import time
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -27,15 +26,6 @@ settings.register_profile(
 )
 settings.register_profile("random", deadline=None, print_blob=True, database=None)
 settings.load_profile("tests")
-
-
-@pytest.hookimpl(tryfirst=True, wrapper=True)
-def pytest_runtest_protocol() -> Generator[None, bool | None, bool | None]:
-    """Hold every worker but the first while slow tests of processes need the other core (Makefile)."""
-    folder, worker = os.environ.get("EDGE_TEST_FOLDER"), os.environ.get("PYTEST_XDIST_WORKER", "gw0")
-    while folder is not None and worker != "gw0" and Path(folder, "one-worker").exists():
-        time.sleep(0.2)
-    return (yield)
 
 
 @pytest.fixture(scope="session")
