@@ -18,7 +18,6 @@ from tools.train.config.checks import TrainError
 from tools.train.config.collect import RATE_HZ
 from tools.train.config.imitate import TIC_VLA
 from tools.train.config.recipe import ALL, Recipe
-from tools.train.config.sft import SftConfig
 from tools.train.drives.drive import file_sha256
 from tools.train.encoder import encoder
 from tools.train.imitate import imitate
@@ -198,7 +197,7 @@ def budget_of(recipe: Recipe, steps: Sequence[Step], device: str) -> list[Line]:
     rates = throughputs(recipe.model.name, device)
     lines: list[Line] = []
     for step in steps:
-        lines += [Line(step.name, what, count, rates.get(key)) for what, count, key in _work(recipe, step)]
+        lines += [Line(step.name, what, count, rates.get(key)) for what, count, key in _work(recipe, step) if count > 0]
     return lines
 
 
@@ -215,7 +214,7 @@ def _work(recipe: Recipe, step: Step) -> Work:
             ("pictures learned from", frames.count * recipe.encoder.epochs, "encoder"),
         ]
     elif step.stage == "sft":
-        work = _sft(recipe.sft, seconds)
+        work = _sft(recipe, seconds)
     elif step.stage == "imitate":
         states = [("semantic states", seconds * recipe.imitate.states.draws, "kv")]
         work = states if recipe.imitate.policy == TIC_VLA else []
@@ -234,10 +233,15 @@ def _work(recipe: Recipe, step: Step) -> Work:
     return _after_round(recipe, step.stage, work) if step.round and step.stage in GO_ON else work
 
 
-def _sft(config: SftConfig, seconds: int) -> Work:
+def _sft(recipe: Recipe, seconds: int) -> Work:
+    config = recipe.sft
     deciding = 1 + _DECIDE * (config.deciding - 1)
     anchors = round(seconds * (deciding * (1 + _RELABELLED * config.retold.ways))) * config.epochs
-    drives = [("frames encoded", seconds * RATE_HZ, "encode"), ("anchors learned", anchors, "sft")]
+    drives = [
+        ("frames encoded", seconds * RATE_HZ, "encode"),
+        ("other instructions found", recipe.collect.episodes * config.retold.ways, "relabel"),
+        ("anchors learned", anchors, "sft"),
+    ]
     if not config.tours.count:
         return drives
     toured = round(_TOUR_S * config.tours.count)
@@ -246,6 +250,7 @@ def _sft(config: SftConfig, seconds: int) -> Work:
         *drives,
         (f"{_OF_TOURS}made", config.tours.count, "tour"),
         (f"{_OF_TOURS}frames encoded", toured * (2 if config.mirrored > 0 else 1), "encode"),
+        (f"{_OF_TOURS}other instructions found", config.tours.count * config.retold.tour_ways, "relabel"),
         (f"{_OF_TOURS}anchors learned", retoured * config.epochs, "sft"),
     ]
 
@@ -258,14 +263,13 @@ def _after_round(recipe: Recipe, stage: str, work: Sequence[tuple[str, int, str]
     config = recipe.imitate if stage == "imitate" else recipe.sft
     share = config.go_on_share or 1.0
     # The length of an SFT epoch grows with the number of drives; imitation has a fixed number of samples.
-    shares = {"kv": more, "encode": more, "sft": share * (more if dagger.newest_only else 1.0)}
+    shares = {"kv": more, "encode": more, "relabel": more, "sft": share * (more if dagger.newest_only else 1.0)}
     # No new tours; a share of them is trained on again.
-    tours = {"tour": 0.0, "encode": 0.0, "sft": share * recipe.sft.tours_again}
-    counts = (
+    tours = {"tour": 0.0, "encode": 0.0, "relabel": 0.0, "sft": share * recipe.sft.tours_again}
+    return [
         (what, round(count * (tours if what.startswith(_OF_TOURS) else shares).get(key, share)), key)
         for what, count, key in work
-    )
-    return [line for line in counts if line[1] > 0]
+    ]
 
 
 def lines_of(recipe: Recipe, steps: Sequence[Step], budget: Sequence[Line], device: str) -> list[str]:
