@@ -239,7 +239,7 @@ def _sft(recipe: Recipe, seconds: int) -> Work:
     anchors = round(seconds * (deciding * (1 + _RELABELLED * config.retold.ways))) * config.epochs
     drives = [
         ("frames encoded", seconds * RATE_HZ, "encode"),
-        ("other instructions found", recipe.collect.episodes * config.retold.ways, "relabel"),
+        ("other instructions", recipe.collect.episodes * config.retold.ways, "relabel"),
         ("anchors learned", anchors, "sft"),
     ]
     if not config.tours.count:
@@ -250,7 +250,7 @@ def _sft(recipe: Recipe, seconds: int) -> Work:
         *drives,
         (f"{_OF_TOURS}made", config.tours.count, "tour"),
         (f"{_OF_TOURS}frames encoded", toured * (2 if config.mirrored > 0 else 1), "encode"),
-        (f"{_OF_TOURS}other instructions found", config.tours.count * config.retold.tour_ways, "relabel"),
+        (f"{_OF_TOURS}other instructions", config.tours.count * config.retold.tour_ways, "relabel"),
         (f"{_OF_TOURS}anchors learned", retoured * config.epochs, "sft"),
     ]
 

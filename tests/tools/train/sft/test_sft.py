@@ -140,7 +140,7 @@ def test_the_budget_of_a_round_has_no_tours_to_make() -> None:
 def test_the_budget_counts_the_other_instructions_of_drives_and_of_tours() -> None:
     few = ["collect.episodes=30", "sft.tours.count=100", "sft.retold.ways=2", "sft.retold.tour_ways=3"]
     lines = {line.what: line.samples for line in budget_of(load_recipe("nano", few), [Step("sft")], "cpu")}
-    assert lines["other instructions found"] == 60 and lines["tours: other instructions found"] == 300
+    assert lines["other instructions"] == 60 and lines["tours: other instructions"] == 300
     none = load_recipe("nano", [*few, "sft.retold.ways=0", "sft.retold.tour_ways=0"])
     assert not any("instructions" in line.what for line in budget_of(none, [Step("sft")], "cpu"))
 
