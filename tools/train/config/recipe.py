@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, get_args, get_origin
 from zlib import crc32
 
 import numpy as np
@@ -23,7 +23,7 @@ from export.model.config import (
     with_overrides,
 )
 from firmware_bridge.system.input_file import read_toml
-from tools.train.config.collect import CollectConfig, DaggerConfig
+from tools.train.config.collect import KINDS, CollectConfig, DaggerConfig
 from tools.train.config.encoder import EncoderConfig
 from tools.train.config.imitate import ImitateConfig
 from tools.train.config.rl import EvaluateConfig, RlConfig
@@ -228,5 +228,7 @@ def _set(content: dict[str, Any], kinds: Mapping[str, type], setting: str) -> No
 
 
 def _fields_of(kind: object) -> Mapping[str, Any]:
-    """Return the types of a dataclass's fields; empty for other types."""
+    """Return the types of a dataclass's fields, or of the shares of a table `kinds`; empty for other types."""
+    if get_origin(kind) is Mapping:
+        return dict.fromkeys(KINDS, get_args(kind)[1])
     return field_types(kind) if isinstance(kind, type) and is_dataclass(kind) else {}

@@ -40,6 +40,13 @@ def test_a_setting_changes_one_number_of_a_stage_and_leaves_its_neighbours() -> 
     assert changed.seed == 3 and changed.dagger.rounds == 0 and changed.rl == plain.rl
 
 
+def test_a_setting_changes_the_share_of_one_kind_of_scenes() -> None:
+    settings = ["sft.tours.kinds.office=0.5", "collect.kinds.corridor=1"]
+    plain, changed = load_recipe("nano"), load_recipe("nano", settings)
+    assert changed.sft.tours.kinds == {**plain.sft.tours.kinds, "office": 0.5}
+    assert changed.collect.kinds == {"corridor": 1.0}
+
+
 def test_a_setting_may_change_the_network() -> None:
     changed = load_recipe("nano", ["model.action.latency_aware=false"]).model
     assert changed == replace(NANO, action=replace(NANO.action, latency_aware=False))
@@ -54,6 +61,8 @@ def test_a_setting_may_change_the_network() -> None:
         ("sft.epochs", "KEY=VALUE"),
         ("sft=3", "STAGE.field"),
         ("sft.epochs.x=1", r"epochs is a value \(\d+\), so no key is expected below it"),
+        ("sft.tours.kinds.ofice=1", "did you mean office"),
+        ("sft.tours.kinds.office=-1", "shares of 0 or more"),
         ("model.action.layer=3", "not a number of the model"),
         ("sft.epochs=0", r"\[sft\]"),
         ("seed=-1", "seed from 0"),
