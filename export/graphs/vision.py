@@ -72,7 +72,7 @@ def _stem(g: GraphWriter, vision: VisionEncoder, frame: str) -> str:
     kind = np.dtype(np.float32) if exact else g.float
     bits = "fp16" if g.precision.default == "fp16" or (g.half and not exact) else "fp32"
     pixels = g.cast(frame, TensorProto.FLOAT if exact else g.float_type)
-    # Transposed first: ONNX Runtime subtracts from rows of three values 20 times slower than from planes.
+    # Transposed first: ONNX Runtime subtracts from planes over 20 times as fast as from rows of three values.
     planes = g.op("Transpose", [pixels], perm=[0, 3, 1, 2])
     x = g.op("Sub", [planes, g.constant(array(vision.mean).astype(kind)[:, None, None], "mean")])
     scale = array(vision.inv_std)[None, :, None, None]
