@@ -14,8 +14,8 @@ from export.core.cache import StageCache, open_cache
 from tests.support.processes import claimed_dds_domain, locked
 
 # `tests` gives the same few examples in every run and does not shrink a failing one: shrinking may take five minutes.
-# `random` is what `make test-random` asks for: more examples, with a seed that it prints. How long an example takes is
-# no evidence on a shared machine.
+# `seeded` is the same with examples of the seed that CI prints; `random` is what `make test-random` asks for: more
+# examples, with a seed that it prints. How long an example takes is no evidence on a shared machine.
 settings.register_profile(
     "tests",
     max_examples=40,
@@ -24,6 +24,7 @@ settings.register_profile(
     print_blob=True,
     phases=(Phase.explicit, Phase.generate),
 )
+settings.register_profile("seeded", settings.get_profile("tests"), derandomize=False, database=None)
 settings.register_profile("random", deadline=None, print_blob=True, database=None)
 settings.load_profile("tests")
 

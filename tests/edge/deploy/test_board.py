@@ -366,8 +366,9 @@ def test_a_release_survives_its_own_record(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(600)  # pip downloads and unpacks beside the tests of processes
 def test_the_real_command_installs_this_package_whose_programs_start_and_check_artifacts(
-    artifacts_dir: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    artifacts_dir: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("PIP_NO_COMPILE", "0")  # pip's way to say --no-compile: most modules are never loaded here
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "wheel", "-q", "--no-deps", "-w", tmp_path]
     subprocess.run([*pip, "--no-build-isolation", REPOSITORY], check=True)
     (wheel,) = tmp_path.glob("*.whl")
