@@ -14,11 +14,15 @@ LONGEST_LINE: Final = 1500
 
 def one_line(text: object) -> str:
     """Return a message as one printable line of at most LONGEST_LINE characters."""
-    line = "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in str(text))
+    whole, half = str(text), LONGEST_LINE // 2 - 10
+    line = _printable(whole[: LONGEST_LINE + 1])
     if len(line) > LONGEST_LINE:
-        half = LONGEST_LINE // 2 - 10
-        line = f"{line[:half]} [...] {line[-half:]}"
+        line = f"{line[:half]} [...] {_printable(whole[-half:])[-half:]}"
     return line
+
+
+def _printable(text: str) -> str:
+    return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
 
 
 def print_line(line: str) -> None:

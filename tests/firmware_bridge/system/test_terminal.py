@@ -15,8 +15,9 @@ def test_other_languages_stay_readable() -> None:
     assert one_line("gehe zur Tür, 走") == "gehe zur Tür, 走"
 
 
-def test_a_long_message_keeps_its_beginning_and_its_end() -> None:
-    line = one_line("begin" + "x" * 100_000 + "end")
+@pytest.mark.parametrize("middle", ["x" * 100_000, "\x1b" * 100_000, "\x1b" * 400])
+def test_a_long_message_keeps_its_beginning_and_its_end(middle: str) -> None:
+    line = one_line(f"begin{middle}end")
     assert len(line) <= LONGEST_LINE and line.startswith("begin") and line.endswith("end")
 
 
