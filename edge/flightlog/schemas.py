@@ -99,6 +99,7 @@ SCHEMAS: Mapping[str, Schema] = {
             "max_new_tokens",
             "decode_calls",
             "call_tokens",
+            "published_ns",
         ),
         generation=_INT,
         instruction=_TEXT,  # the run's, or another that was given later
@@ -107,6 +108,7 @@ SCHEMAS: Mapping[str, Schema] = {
         started_ns=_INT,
         finished_ns=_INT,
         ready_ns=_INT,
+        published_ns=_INT,  # when the control thread could read it
         release_delay_s=_NUMBER,
         frames_ns={"type": "array", "items": _INT},  # stamps of /camera, oldest first
         frame_poses=_ROWS,  # (x m, y m, θ rad) at those

@@ -291,10 +291,11 @@ class ReasoningLoop:
         state = task.publish(result, number=number, ready_ns=ready_ns, text_complete=outputs.text_complete)
         # First the state, then the permission to drive: between the two, the earlier permission has run out.
         self._slot.state = state
+        published_ns = self._clock()
         self._slot.drive_until_ns = outputs.drive_until_ns
         self.times.generation_ms.add((finished_ns - started_ns) / 1e6)
         self.times.anchor_to_ready_ms.add((ready_ns - anchor.stamp_ns) / 1e6)
-        self._record(task, result, state, (started_ns, finished_ns), delay_s)
+        self._record(task, result, state, (started_ns, finished_ns, published_ns), delay_s)
         return True
 
     def _rest(self) -> None:
@@ -350,15 +351,16 @@ class ReasoningLoop:
         task: GenerationTask,
         result: GenerationResult,
         state: SemanticState,
-        computed_ns: tuple[int, int],
+        times_ns: tuple[int, int, int],
         delay_s: float,
     ) -> None:
-        """Log a generation that was published; `computed_ns`: when it started and finished."""
+        """Log a generation; `times_ns`: when it started and finished, and when the control thread could read it."""
         if self._outputs.recorder is None:
             return
         record = {
-            "started_ns": computed_ns[0],
-            "finished_ns": computed_ns[1],
+            "started_ns": times_ns[0],
+            "finished_ns": times_ns[1],
+            "published_ns": times_ns[2],
             "release_delay_s": delay_s,
             **task.state_record(result, state),
             "context_ms": self._context_ns / 1e6,

@@ -196,6 +196,15 @@ def test_only_the_newest_released_generation_counts(
 
 
 @pytest.mark.slow
+def test_a_tick_uses_the_older_generation_until_the_newer_is_published(tmp_path: Path) -> None:
+    ticks, semantics = synthetic_run.tick_records(12.0), synthetic_run.generations(12.0)
+    tick = next(t for t in ticks if t["generation"] == 1)
+    tick.update(generation=semantics[0]["generation"])
+    semantics[1]["published_ns"] = tick["now_ns"]  # later than ready, as under load
+    assert _checks_of(tmp_path, ticks=ticks, semantics=semantics)["stale_generation_ticks"].value == 0
+
+
+@pytest.mark.slow
 def test_a_fault_of_the_runner_fails_and_is_shown(tmp_path: Path) -> None:
     synthetic_run.write_run(tmp_path)
     result = {**synthetic_run.run_result(12.0), "faults": ["the bridge stopped the robot: deadman"]}

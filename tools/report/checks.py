@@ -24,7 +24,7 @@ REACHED_M = 1.5
 REACHABLE_S = 60.0
 """In a shorter run the goal cannot be reached."""
 
-# A generation is stamped ready, then swapped in by another thread: a tick within this time may still see the old one.
+# A tick reads the generation, then the clock: one that was published in between may have come too late for it.
 SWAP_RACE_NS = 10_000_000
 
 
@@ -86,13 +86,14 @@ def delay_errors_ms(log: FlightLog) -> tuple[list[float], list[str]]:
 def stale_generation_ticks(log: FlightLog) -> int:
     """Count ticks that used a generation before its release, or an older one or none after a newer was released."""
     ready_ns = [s["ready_ns"] for s in log.semantics]
+    published_ns = [s.get("published_ns", s["ready_ns"]) for s in log.semantics]  # older logs have no such stamp
     index_of = {s["generation"]: index for index, s in enumerate(log.semantics)}
     wrong = 0
     for tick in log.ticks:
         used = -1 if tick["generation"] is None else index_of.get(tick["generation"], -2)
         newest = bisect_right(ready_ns, tick["now_ns"]) - 1
-        surely_released = bisect_right(ready_ns, tick["now_ns"] - SWAP_RACE_NS) - 1
-        if not surely_released <= used <= newest:
+        surely_published = bisect_right(published_ns, tick["now_ns"] - SWAP_RACE_NS) - 1
+        if not surely_published <= used <= newest:
             wrong += 1
     return wrong
 

@@ -6,12 +6,15 @@ import os
 import threading
 import time
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
+from edge.inference.generation_task import GenerationTask
 from edge.reasoning.decoding_rules import DecodingContext
 from edge.reasoning.generation_cycle import ReasoningBudget
 from edge.run.reasoning_loop import ReasoningLoop
+from edge.state.semantic import SemanticState
 from edge.state.switches import Decoding
 from tests.support.runner.reasoning_bench import TEXT, Bench, Clock, FakeRun
 
@@ -47,6 +50,22 @@ def test_the_recorded_state_is_the_published_one(bench: Bench) -> None:
     assert (record["anchor_ns"], record["frames_ns"], record["new_tokens"]) == (2_000_000_000, [2_000_000_000], 3)
     times = bench.loop.times
     assert {len(each) for each in (times.generation_ms, times.anchor_to_ready_ms, times.late_anchor_ms)} == {1}
+
+
+def test_the_record_says_when_the_control_thread_could_read_it(
+    bench: Bench, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    publish = GenerationTask.publish
+
+    def wait_for_a_core(*args: Any, **kwargs: Any) -> SemanticState:
+        clock.s += 0.03
+        return publish(*args, **kwargs)
+
+    monkeypatch.setattr(GenerationTask, "publish", wait_for_a_core)
+    bench.frame(2.0)
+    bench.loop.step()
+    [record] = bench.records
+    assert record["published_ns"] - record["ready_ns"] == pytest.approx(30e6, abs=1e3)
 
 
 # The thread
