@@ -54,11 +54,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         result = _main(args)
         result["peak_rss_bytes"] = peak_rss_bytes()
         result["wall_s"] = round((time.monotonic_ns() - started_ns) / 1e9, 3)
-        if int(os.environ.get("RANK", "0")) == 0:
+        if _speaks():
             write_result(args.json, result)
     except KeyboardInterrupt:
         again = "; continue with --resume" if args.out is not None else ""
-        return _fail(EXIT_INTERRUPTED, f"interrupted, finished work is kept{again}")
+        line = f"interrupted, finished work is kept{again}"
+        return _fail(EXIT_INTERRUPTED, line) if _speaks() else EXIT_INTERRUPTED
     except (ExportError, OutputError, RunsError, StageFailedError) as error:
         return _fail(EXIT_CHECK_FAILED, str(error))
     except ArtifactError as error:
@@ -70,6 +71,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         return _fail(EXIT_BAD_INPUT, str(error))
     return EXIT_DONE
+
+
+def _speaks() -> bool:
+    """Return whether this process reports what all processes of torchrun do: the first."""
+    return int(os.environ.get("RANK", "0")) == 0
 
 
 def is_ours(error: Exception) -> bool:
@@ -244,7 +250,9 @@ def stop_flag() -> Iterator[StopFlag]:
         if flag.requested:
             raise KeyboardInterrupt
         flag.requested = True
-        sys.stderr.write(f"{COMMAND}: stopping after this step, with a checkpoint; press again to stop immediately\n")
+        if _speaks():
+            again = "press again to stop immediately"
+            sys.stderr.write(f"{COMMAND}: stopping after this step, with a checkpoint; {again}\n")
 
     before: dict[int, Callable[[int, FrameType | None], Any] | int | None] = {
         number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)

@@ -327,7 +327,9 @@ def test_two_processes_share_the_stages_that_can_be_shared_and_the_first_does_th
 
 @pytest.mark.slow
 def test_processes_stop_together_on_one_request_and_go_on_together(tmp_path: Path) -> None:
-    assert codes(two_ranks("tests.support.train.train_chain_rank", str(tmp_path), "stop")) == [EXIT_INTERRUPTED] * 2
+    stopped = two_ranks("tests.support.train.train_chain_rank", str(tmp_path), "stop")
+    assert codes(stopped) == [EXIT_INTERRUPTED] * 2
+    assert ["interrupted, finished work is kept" in text for _, text in stopped] == [True, False]
     before = [(tmp_path / f"{rank}.txt").read_text().split() for rank in range(2)]
     assert before[0][-3] == before[1][-3] == "encoder"
     ended = two_ranks("tests.support.train.train_chain_rank", str(tmp_path), "done")
