@@ -2,8 +2,9 @@
 PYTHON ?= python3
 BIN := .venv/bin
 comma := ,
-# pip's log is kept, not shown: it is long, and of use only when an install fails.
-install = $(BIN)/python -m pip --disable-pip-version-check install -c constraints.txt -e ".[$(1)]" > .venv/install.log 2>&1 || { tail -n 15 .venv/install.log >&2; echo "make: the install failed; the whole log is in .venv/install.log" >&2; exit 1; }
+# pip's log is kept, not shown: it is long, and of use only when an install fails. Modules are compiled at their
+# first import, 15 s in all: pip would compile some 18,000, of which 2,600 are imported, in 70 s (measured, 2.0 GHz Xeon).
+install = $(BIN)/python -m pip --disable-pip-version-check install --no-compile -c constraints.txt -e ".[$(1)]" > .venv/install.log 2>&1 || { tail -n 15 .venv/install.log >&2; echo "make: the install failed; the whole log is in .venv/install.log" >&2; exit 1; }
 SEED ?= 0
 PEOPLE ?= 4
 DURATION ?= 60
