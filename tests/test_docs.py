@@ -13,6 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from sim_hil.benchmark.results.store import read_results
+from sim_hil.benchmark.results.summary import summarise
+
 if sys.version_info >= (3, 11):
     import tomllib
 else:
@@ -154,6 +157,13 @@ def test_every_option_beside_a_command_is_in_its_help(
         for use in named:
             if use.subcommand == subcommand:
                 assert set(use.options) <= shown, f"{use.page}: {command} {subcommand}: {set(use.options) - shown}"
+
+
+def test_the_published_run_has_the_rates_of_its_page() -> None:
+    rates = summarise(read_results(ROOT / "docs/runs/dynanav-fresh-nano"))
+    sr, cr = (f"{rates[key]:.1f} ({' to '.join(f'{end:.1f}' for end in rates[f'{key}_ci95'])})" for key in ("sr", "cr"))
+    row = f"| {rates['episodes']} | {rates['episodes'] * rates['sr'] / 100:.0f} | {sr} | {rates['spl']:.1f} | {cr} |"
+    assert row in (ROOT / "docs/results.md").read_text(encoding="utf-8")
 
 
 def test_the_readme_stays_short() -> None:
