@@ -2,7 +2,7 @@
 
 A browser, ffmpeg or OpenCV can read it; the server listens on the loopback interface only.
   GET /stream.mjpg   multipart/x-mixed-replace, one JPEG per part, at most at the camera's rate
-  GET /frame.jpg     the next image
+  GET /frame.jpg     the next image whose rendering begins after the request
 Every image has the header "X-Capture-Ns": time.monotonic_ns of the rendered pose. Without a client nothing is rendered.
 `CameraStream` is the parent's handle: it passes the pose to the process through shared memory.
 """
@@ -118,8 +118,10 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_error(404, "expected /stream.mjpg or /frame.jpg")
 
     def _frame(self) -> None:
-        shutter = self.server.shutter
+        shutter, asked_ns = self.server.shutter, time.monotonic_ns()
         picture = shutter.next_after(shutter.newest, _FRAME_TIMEOUT_S)
+        if picture is not None and picture.captured_ns < asked_ns:  # its rendering had begun for an earlier request
+            picture = shutter.next_after(picture.number, _FRAME_TIMEOUT_S)
         if picture is None:
             self.send_error(503, "no image")
             return

@@ -6,6 +6,7 @@ import threading
 import time
 import urllib.request
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from http.client import HTTPConnection, HTTPResponse
 
 import cv2
@@ -22,13 +23,14 @@ SIZE = (160, 90)
 
 
 class Studio:
-    """A server whose pictures are numbered and made as fast as they are wanted."""
+    """A server whose pictures are numbered, stamped and made as fast as they are wanted."""
 
     def __init__(self) -> None:
         self.shutter = Shutter()
         self.server = CameraServer(listen(0), self.shutter)
         self.port = int(self.server.server_address[1])
-        self.made = 0
+        self.captured_ns: list[int] = []
+        self.hold = threading.Event()
         self._ending = False
         self._threads = [threading.Thread(target=work) for work in (self.server.serve_forever, self._render)]
         for thread in self._threads:
@@ -36,9 +38,9 @@ class Studio:
 
     def _render(self) -> None:
         while not self._ending:
-            if self.shutter.wanted:
-                self.made += 1
-                self.shutter.show(1000 + self.made, b"picture %d" % self.made)
+            if self.shutter.wanted and not self.hold.is_set():
+                self.captured_ns.append(time.monotonic_ns())
+                self.shutter.show(self.captured_ns[-1], b"picture %d" % len(self.captured_ns))
             time.sleep(0.001)
 
     def get(self, path: str) -> HTTPResponse:
@@ -63,11 +65,24 @@ def studio() -> Iterator[Studio]:
 
 def test_an_image_is_rendered_after_its_request_and_has_a_stamp(studio: Studio) -> None:
     time.sleep(0.05)
-    assert studio.made == 0, "nobody looks"
+    assert not studio.captured_ns, "nobody looks"
     response = studio.get("/frame.jpg")
     number = int(response.read().split()[1])  # a second picture may be finished before the first is sent
     assert response.status == 200 and number >= 1
-    assert response.headers["X-Capture-Ns"] == str(1000 + number)
+    assert response.headers["X-Capture-Ns"] == str(studio.captured_ns[number - 1])
+
+
+def test_an_image_whose_rendering_began_before_the_request_is_not_its_answer(studio: Studio) -> None:
+    studio.hold.set()
+    began_ns = time.monotonic_ns()
+    waiting = ThreadPoolExecutor(1).submit(lambda: studio.get("/frame.jpg").read())
+    deadline = time.monotonic() + 10
+    while not studio.shutter.wanted:
+        assert time.monotonic() < deadline
+        time.sleep(0.001)
+    studio.shutter.show(began_ns, b"of an earlier request")
+    studio.hold.clear()
+    assert waiting.result(10).startswith(b"picture")
 
 
 def test_a_stream_is_one_new_picture_after_another(studio: Studio) -> None:
@@ -78,7 +93,7 @@ def test_a_stream_is_one_new_picture_after_another(studio: Studio) -> None:
         assert stream.readline().strip() == b"--" + boundary
         headers = dict(line.split(b": ") for line in iter(lambda: stream.readline().strip(), b""))
         numbers.append(int(stream.read(int(headers[b"Content-Length"])).split()[1]))
-        assert int(headers[b"X-Capture-Ns"]) == 1000 + numbers[-1]
+        assert int(headers[b"X-Capture-Ns"]) == studio.captured_ns[numbers[-1] - 1]
         stream.readline()
     assert numbers == sorted(set(numbers))
     stream.close()
