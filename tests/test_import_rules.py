@@ -123,14 +123,14 @@ def test_the_bridge_knows_neither_the_runner_nor_any_machine_learning(path: Path
 @pytest.mark.parametrize("module", ["edge.run.command", "firmware_bridge", "firmware_bridge.bridge"])
 def test_importing_it_pulls_in_neither_torch_nor_pybullet(module: str) -> None:
     code = f"import {module}, sys; sys.exit(bool({{'torch', 'pybullet'}} & set(sys.modules)))"
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=300)
 
 
 @pytest.mark.parametrize("module", ["tools.train.collect.worker", "tools.train.encoder.worker"])
 def test_a_worker_that_draws_pictures_starts_without_torch(module: str) -> None:
     """A new process records every layout: torch's import takes as long as a tour."""
     code = f"import {module}, sys; sys.exit('torch' in sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=300)
 
 
 SLOW_IMPORTS = [pytest.param(name, marks=pytest.mark.slow) for name in ("export.evaluation.gates", "tools.bench.tick")]
@@ -142,4 +142,4 @@ def test_onnx_runtime_is_told_to_keep_no_telemetry_before_it_is_imported(module:
         f"import os, sys; os.environ.pop('ORT_DISABLE_TELEMETRY', None); import {module}; names = list(sys.modules); "
         "assert names.index('edge') < names.index('onnxruntime') and os.environ['ORT_DISABLE_TELEMETRY'] == '1'"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=300)

@@ -239,5 +239,5 @@ class TestRemoved:
 def test_a_stop_is_sent_although_no_message_can_be_written(path: Path, program: str, errors: str) -> None:
     command = f"{sys.executable} -m {program} --socket {path} {errors}"
     with answering(path) as (bridge,):
-        done = subprocess.run(["sh", "-c", command], cwd=REPOSITORY, capture_output=True, check=False, timeout=60)
+        done = subprocess.run(["sh", "-c", command], cwd=REPOSITORY, capture_output=True, check=False, timeout=300)
     assert Stop() in bridge.received and done.returncode == 0

@@ -53,7 +53,7 @@ def base_only(command: str, *arguments: str) -> subprocess.CompletedProcess[str]
     run = "from firmware_bridge.bridge import main" if command == "edge-bridge" else "from edge.commands import run"
     call = "main()" if command == "edge-bridge" else f"run({command!r})"
     code = f"{BASE_ONLY}\nsys.argv = {[command, *arguments]!r}\n{run}\nsys.exit({call})"
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=False)
 
 
 @pytest.mark.parametrize("command", [*COMMANDS, "edge-bridge"])

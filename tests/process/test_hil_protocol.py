@@ -302,7 +302,7 @@ sys.exit(hil.main(sys.argv[1:]))
 """
     more = ("--trace", tmp_path / "t.jsonl", "--json", tmp_path / "r.json", "--duration", 20)
     command = [sys.executable, "-c", code, *map(str, hil_arguments(dds_domain, *more))]
-    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=300)
     assert done.returncode == 1, done.stderr
     assert "the window was closed" in done.stderr.splitlines()[-1]
     assert "Traceback" not in done.stderr

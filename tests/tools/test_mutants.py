@@ -153,6 +153,6 @@ def test_the_command_kills_the_supervisors_mutants_and_a_second_call_has_nothing
     first = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=170, check=False)
     assert first.returncode == 0, first.stdout + first.stderr
     table = subprocess.run(
-        [*command, "--table"], cwd=REPOSITORY, capture_output=True, text=True, timeout=60, check=False
+        [*command, "--table"], cwd=REPOSITORY, capture_output=True, text=True, timeout=300, check=False
     )
     assert table.returncode == 0 and "| `edge.safety.supervisor` |" in table.stdout

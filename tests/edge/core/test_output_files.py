@@ -202,7 +202,7 @@ def test_a_link_to_standard_output_is_written_after_what_is_there(tmp_path: Path
     log.write_text("before\n")
     link.symlink_to("/proc/self/fd/1")
     code = f"from edge.core.cli import write_result; write_result({str(link)!r}, {{'a': 1}})"
-    subprocess.run(["sh", "-c", f'"$0" -c "$1" {how} "$2"', sys.executable, code, str(log)], check=True, timeout=60)
+    subprocess.run(["sh", "-c", f'"$0" -c "$1" {how} "$2"', sys.executable, code, str(log)], check=True, timeout=300)
     text = log.read_text()
     assert text.startswith("before") == (how == ">>")
     assert json.loads(text.removeprefix("before")) == {"a": 1}

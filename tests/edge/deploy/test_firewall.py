@@ -80,7 +80,7 @@ def test_nft_accepts_the_file(tmp_path: Path) -> None:
     command = [str(NFT), "-c", "-f", str(path)]
     if os.geteuid() != 0:
         command = ["unshare", "--map-root-user", "--net", *command]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert (done.returncode, done.stderr) == (0, "")
 
 
@@ -136,7 +136,7 @@ def in_a_network_of_its_own(tmp_path: Path, *lines: str) -> str:
     script += ["ip route add 239.255.0.1/32 dev cable0"]
     script += [f"{NFT} -f {path}", f"{NFT} -f {path}"]  # the second time replaces the first
     command = ["unshare", "--net", "sh", "-c", "\n".join([*script, *lines])]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout
 

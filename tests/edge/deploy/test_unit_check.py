@@ -141,7 +141,7 @@ def test_systemd_makes_the_users_apart_from_each_other(tmp_path: Path) -> None:
     file = tmp_path / "tic-vla-edge.conf"
     file.write_text(sysusers(ServiceUsers()))
     command = ["systemd-sysusers", f"--root={tmp_path}", str(file)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     users = dict(line.split(":")[0:3:2] for line in (tmp_path / "etc/passwd").read_text().splitlines())
     groups = {line.split(":")[0]: line.split(":")[3] for line in (tmp_path / "etc/group").read_text().splitlines()}

@@ -175,7 +175,7 @@ def test_two_exports_of_the_same_weights_are_byte_identical_with_nothing_cached(
     artifacts_dir: Path, tmp_path: Path
 ) -> None:
     assert main([*RANDOM, "--out", str(tmp_path / "cold"), "--no-cache"]) == 0
-    subprocess.run(["diff", "-r", str(artifacts_dir), str(tmp_path / "cold")], check=True, timeout=60)
+    subprocess.run(["diff", "-r", str(artifacts_dir), str(tmp_path / "cold")], check=True, timeout=300)
     assert [path.name for path in tmp_path.iterdir()] == ["cold"]
 
 
@@ -187,7 +187,7 @@ def test_a_cached_export_is_byte_identical_even_if_the_first_was_changed(artifac
     data[1000] ^= 1
     (first / "action_expert.onnx").write_bytes(data)
     assert main([*RANDOM, "--out", str(second)]) == 0
-    subprocess.run(["diff", "-r", str(artifacts_dir), str(second)], check=True, timeout=60)
+    subprocess.run(["diff", "-r", str(artifacts_dir), str(second)], check=True, timeout=300)
 
 
 def export_interrupted_by(number: signal.Signals, command: Sequence[str], stage: str) -> None:
@@ -204,10 +204,10 @@ def export_interrupted_by(number: signal.Signals, command: Sequence[str], stage:
             if f"{stage} · " in line:
                 break
         process.send_signal(number)
-        assert process.wait(timeout=60) == 130
+        assert process.wait(timeout=300) == 130
     finally:
         process.kill()
-        process.wait(timeout=60)
+        process.wait(timeout=300)
         process.stderr.close()
 
 
@@ -228,7 +228,7 @@ def test_an_interrupted_export_leaves_nothing_half_written_and_goes_on_where_it_
     assert "graph action_expert: from the cache" in done.stderr
     assert "gate vision_encoder: from the cache" in done.stderr
     assert done.stdout == ""
-    subprocess.run(["diff", "-r", str(artifacts_dir), str(out)], check=True, timeout=60)
+    subprocess.run(["diff", "-r", str(artifacts_dir), str(out)], check=True, timeout=300)
 
 
 @pytest.mark.slow

@@ -215,9 +215,9 @@ def test_nothing_is_pruned_under_another_process_hands(tmp_path: Path, notes: No
     )
     with open_cache(tmp_path, GIB, notes) as cache:
         cache.fetch_or_build(key("k"), writes("x"))
-        subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True, timeout=60)
+        subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True, timeout=300)
         assert entries(tmp_path) == [key("k")]
-    subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True, timeout=60)
+    subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True, timeout=300)
     assert entries(tmp_path) == []
 
 

@@ -44,7 +44,7 @@ class Studio:
             time.sleep(0.001)
 
     def get(self, path: str) -> HTTPResponse:
-        connection = HTTPConnection("127.0.0.1", self.port, timeout=10)
+        connection = HTTPConnection("127.0.0.1", self.port, timeout=60)
         connection.request("GET", path)
         return connection.getresponse()
 
@@ -142,7 +142,7 @@ def test_the_process_shows_the_world_at_the_pose_it_was_given(state: np.ndarray)
             turned[3:7] = (0.0, 0.0, np.sin(turn / 2), np.cos(turn / 2))
             camera.show(turned)
             before_ns = time.monotonic_ns()
-            with urllib.request.urlopen(url, timeout=20) as response:
+            with urllib.request.urlopen(url, timeout=60) as response:
                 assert int(response.headers["X-Capture-Ns"]) >= before_ns
                 pictures.append(cv2.imdecode(np.frombuffer(response.read(), np.uint8), cv2.IMREAD_COLOR))
         assert pictures[0].shape == (SIZE[1], SIZE[0], 3)

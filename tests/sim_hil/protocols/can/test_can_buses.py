@@ -211,7 +211,7 @@ def in_a_namespace(act: str) -> None:
         [*namespace, "sh", "-c", setup, sys.executable, program],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=300,
         check=False,
     )
     assert done.returncode == 0, done.stderr
