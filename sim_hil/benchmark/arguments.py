@@ -65,6 +65,10 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--suite", required=True, metavar="NAME|FILE", help=f"one of: {', '.join(suite_names())}; or a file")
     p.add_argument("--episodes", action="append", default=[], metavar="GLOB", help="ids to run; may be repeated")
     p.add_argument(
+        "--first", type=int, metavar="N",
+        help="run N episodes, drawn without regard to their kind; always the same, and the first of a larger N",
+    )  # fmt: skip
+    p.add_argument(
         "--policy",
         required=True,
         metavar="P",
@@ -148,6 +152,8 @@ def check(args: argparse.Namespace) -> tuple[Conditions, list[Episode]]:
     check_result_directory(args.out)
     if args.out is not None and not args.resume:
         check_new(args.out)
+    if args.first is not None and args.first < 1:
+        raise ConditionsError(f"--first: expected a number of episodes from 1, found {args.first}")
     if not 1 <= args.jobs <= MAX_JOBS:
         raise ConditionsError(f"--jobs: expected 1 to {MAX_JOBS}, found {args.jobs}")
     if args.cluster is not None:

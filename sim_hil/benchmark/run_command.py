@@ -83,11 +83,11 @@ def _run(args: argparse.Namespace) -> int:
         if not episodes:
             raise ConditionsError(f"--episodes: expected an episode of the {robot.hil_robot}, found none")
     episodes = list(reworded(episodes, conditions, lambda: load_suite(args.suite)))
-    run = BenchRun.plan(args.suite, episodes, conditions)
+    run = BenchRun.plan(args.suite, episodes, conditions, args.first)
     # Signals outermost: a second one must not end the process before the temporary folder is removed.
     with stop_signals() as stop, _output_directory(args.out) as folder, _live_view(args, conditions.clock) as live:
         done = len(read_results(folder)) if args.resume else 0
-        with BenchProgress(len(run.episodes), done, blind=is_fresh(args.suite)) as progress:
+        with BenchProgress(run.asked, min(done, run.asked), blind=is_fresh(args.suite)) as progress:
             execution = execute(
                 run, folder, _backend(args), resume=args.resume, video=args.video,
                 flights=_flight_logs(args), stopped=lambda: bool(stop), live=live, watcher=progress.watcher,
@@ -97,7 +97,7 @@ def _run(args: argparse.Namespace) -> int:
         _write_outputs(args, store, result)
     if not finished:
         advice = f"; continue with --resume --out {args.out}" if args.out is not None else ""
-        counted = f"{result['summary']['episodes']} of {len(run.episodes)} episodes have a result"
+        counted = f"{result['summary']['episodes']} of {run.asked} episodes have a result"
         return _report_problem(f"interrupted, {counted}{advice}", EXIT_INTERRUPTED)
     if not store.results:
         return _report_problem("no episode has a result: nothing was measured", EXIT_CHECK_FAILED)

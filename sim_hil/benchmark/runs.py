@@ -47,16 +47,20 @@ _PACKAGES = (
 
 @dataclass(frozen=True)
 class BenchRun:
-    """Plan of a run; `trained`: from the manifest, True for a policy without one."""
+    """Plan of a run; `trained`: from the manifest, True for a policy without one; `first`: see `tasks`.
+
+    `first` is no part of the configuration: a resumed run can have more or fewer.
+    """
 
     suite: str
     episodes: tuple[Episode, ...]
     conditions: Conditions
     manifest_sha256: str
     trained: bool
+    first: int | None = None
 
     @staticmethod
-    def plan(suite: str, episodes: Sequence[Episode], conditions: Conditions) -> BenchRun:
+    def plan(suite: str, episodes: Sequence[Episode], conditions: Conditions, first: int | None = None) -> BenchRun:
         """Check everything that is known before the first episode, and connect once to an external policy.
 
         Raises ArtifactError, ConditionsError, ExternalError.
@@ -69,11 +73,16 @@ class BenchRun:
         if artifacts is not None:
             conditions = conditions.with_defaults_of(artifacts.runtime.switches)
         sha256, trained = ("", True) if artifacts is None else (artifacts.manifest_sha256, artifacts.trained)
-        run = BenchRun(suite, tuple(episodes), conditions, sha256, trained)
+        run = BenchRun(suite, tuple(episodes), conditions, sha256, trained, first)
         run.tasks(Path())
         if conditions.policy.kind == "external":
             open_policy(conditions).close()
         return run
+
+    @property
+    def asked(self) -> int:
+        """Number of episodes to run."""
+        return len(self.episodes[: self.first])
 
     def config(self) -> dict[str, Any]:
         """Return the configuration that a resumed run must share."""
@@ -95,15 +104,15 @@ class BenchRun:
     ) -> list[EpisodeTask]:
         """Return one task per episode in the order of their start. Raises ConditionsError.
 
-        The longest come first, for an even load; those of the fresh suite in an order without regard to their kind, so
-        that the rates of an unfinished run are of a fair sample.
+        The longest come first, for an even load. Those of the fresh suite, and of a run of the `first` few, come in an
+        order without regard to their kind, so that the rates of an unfinished run are of a fair sample.
         """
         tasks = [
             EpisodeTask(episode, self.conditions, folder, video, flights, self.manifest_sha256, live=live)
             for episode in self.episodes
         ]
-        if is_fresh(self.suite):
-            return sorted(tasks, key=lambda task: crc32(task.episode.id.encode()))
+        if is_fresh(self.suite) or self.first is not None:
+            return sorted(tasks, key=lambda task: crc32(task.episode.id.encode()))[: self.first]
         # Simulation time grows with the time limit and the crowd.
         return sorted(tasks, key=lambda task: -task.episode.timeout_s * (20 + task.episode.people))
 
@@ -128,7 +137,7 @@ def bench_result(run: BenchRun, store: ResultStore, *, finished: bool, started_n
     return {
         "summary": {
             **summarise(results),
-            "asked": len(run.episodes),
+            "asked": run.asked,
             "failed_runs": len(store.failed),
             "finished": finished,
         },

@@ -112,6 +112,17 @@ def test_the_log_of_an_episode_has_a_row_a_control_period(two_jobs: Path) -> Non
 
 
 @pytest.mark.slow
+def test_a_run_of_the_first_few_episodes_can_be_extended(suite: Path, two_jobs: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    arguments = ["--suite", str(suite), "--policy", "random", "--drift", "severe", "--out", str(out)]
+    assert cli.main([*arguments, "--first", "1"]) == 0
+    summary = json.loads((out / "result.json").read_text())["summary"]
+    assert (summary["asked"], summary["finished"], len(hashes(out))) == (1, True, 1)
+    assert cli.main([*arguments, "--resume"]) == 0
+    assert hashes(out) == hashes(two_jobs)
+
+
+@pytest.mark.slow
 def test_without_an_output_directory_the_result_is_only_printed(
     suite: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -148,6 +159,7 @@ def test_signals_wait_until_the_temporary_folder_is_removed(
         (("--clock", "realtime"), 2, "--clock realtime: expected --policy artifacts:DIR"),
         (("--live",), 2, "--live: expected --clock realtime"),
         (("--jobs", "0"), 2, "--jobs: expected 1 to 256, found 0"),
+        (("--first", "0"), 2, "--first: expected a number of episodes from 1, found 0"),
         (("--wording", "9"), 2, "wording 9: episode walk-1 has 4"),
         (("--resume",), 2, "need a directory: add --out DIR"),
         (("--video", "all"), 2, "need a directory: add --out DIR"),

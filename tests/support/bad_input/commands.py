@@ -186,7 +186,7 @@ TABLE: Final = (
          "--swap-instructions": numbers("-1", "1.5"), "--turn-starts": numbers("-1", "1.5"),
          "--decoding": choices, "--recovery": choices,
          "--camera": texts("", "0x0", "nanx1", "99999x99999", "1"), "--external-timeout": numbers("-1", "0"),
-         "--jobs": numbers("-1", "0", "1000000"),
+         "--jobs": numbers("-1", "0", "1000000"), "--first": numbers("-1", "0", "1.5"),
          "--cluster": texts("", "nope", "nope:1", ":1", "127.0.0.1:1", "127.0.0.1:99999", "127.0.0.1:-1",
          "\x1b[2J:1"),
          "--json": outputs, "--out": output_directories, "--video": choices}, says=("address",),
