@@ -17,7 +17,7 @@ import onnxruntime as ort
 
 from edge.artifacts.files import ArtifactError
 from edge.artifacts.manifest import Artifacts, load_artifacts
-from edge.core.cli import EXIT_DONE, command_line, write_result
+from edge.core.cli import EXIT_DONE, check_result_target, command_line, write_result
 from edge.inference.graph import DTYPES, Array
 from tools.bench import bad_input, command_parser
 
@@ -95,6 +95,7 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("--threads", type=int, default=2)
     args = p.parse_args(argv)
     try:
+        check_result_target(args.json)
         artifacts = load_artifacts(args.artifacts.absolute())
         names = args.graphs or list(artifacts.graphs)
         unknown = sorted(set(names) - set(artifacts.graphs))

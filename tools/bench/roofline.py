@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
-from edge.core.cli import EXIT_DONE, command_line, write_result
+from edge.core.cli import EXIT_DONE, check_result_target, command_line, write_result
 from export.core.typed import FieldError, build
 from export.model.config import PRESETS, LanguageConfig, TicVlaConfig
 from export.plan.plan import plan
@@ -218,6 +218,7 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("--rows", type=Path, default=ROWS, metavar="FILE.toml", help="measurements (default: ours)")
     args = p.parse_args(argv)
     try:
+        check_result_target(args.json)
         rows, configs = load_rows(args.rows)
         residuals = [predict(row, configs[row.model]) for row in rows]
         if not any(r.measurement.kind in COUNTED for r in residuals):

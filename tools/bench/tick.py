@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from edge.artifacts.files import ArtifactError, read_manifest
 from edge.artifacts.manifest import load_artifacts
-from edge.core.cli import EXIT_DONE, command_line, write_result
+from edge.core.cli import EXIT_DONE, check_result_target, command_line, write_result
 from edge.core.geometry import SE2
 from edge.inference.policy import Policy
 from edge.state.semantic import SemanticState
@@ -108,6 +108,7 @@ def main(argv: list[str] | None = None) -> int:
     args = p.parse_args(argv)
     rng = np.random.default_rng(0)
     try:
+        check_result_target(args.json)
         if args.rounds < 1 or not 1 <= args.tokens <= 100_000:
             raise ArtifactError("--rounds and --tokens must be positive")
         os.sched_setaffinity(0, {args.core})

@@ -22,7 +22,7 @@ import edge.signature
 import export.cli
 import firmware_bridge.bridge
 import sim_hil.layouts.__main__
-import tools.bench.governor
+import tools.bench.roofline
 import tools.train.cli
 from edge import commands
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_REFUSED, OutputError, write_result
@@ -61,7 +61,7 @@ COMMANDS: dict[str, tuple[Command, int]] = {
     "edge-doctor": (lambda where, _: edge.deploy.doctor.command.main(["--ticks", "0", "--json", where]), EXIT_DONE),
     "signature": (keygen, EXIT_DONE),
     "layouts": (layouts, EXIT_DONE),
-    "governor": (lambda where, _: tools.bench.governor.main(["--seconds", "61", "--json", where]), EXIT_DONE),
+    "roofline": (lambda where, _: tools.bench.roofline.main(["--json", where]), EXIT_DONE),
 }
 
 
@@ -212,7 +212,7 @@ def test_a_link_to_standard_output_is_written_after_what_is_there(tmp_path: Path
 @pytest.mark.parametrize(
     "arguments",
     [
-        pytest.param(("tools.bench.governor", "--seconds", "61"), marks=pytest.mark.slow, id="tool"),
+        pytest.param(("tools.bench.roofline",), marks=pytest.mark.slow, id="tool"),
         pytest.param(("firmware_bridge.bridge", "status", "--robot", str(ROBOT)), id="edge-bridge"),
     ],
 )
