@@ -61,7 +61,7 @@ class BenchRun:
 
     @staticmethod
     def plan(suite: str, episodes: Sequence[Episode], conditions: Conditions, first: int | None = None) -> BenchRun:
-        """Check everything that is known before the first episode, and connect once to an external policy.
+        """Check everything that is known before the first episode; connect once to an external policy.
 
         Raises ArtifactError, ConditionsError, ExternalError.
         """
@@ -75,7 +75,7 @@ class BenchRun:
         sha256, trained = ("", True) if artifacts is None else (artifacts.manifest_sha256, artifacts.trained)
         run = BenchRun(suite, tuple(episodes), conditions, sha256, trained, first)
         run.tasks(Path())
-        if conditions.policy.kind == "external":
+        if conditions.policy.kind in ("external", "point-goal-net"):
             open_policy(conditions).close()
         return run
 
