@@ -60,8 +60,8 @@ class Robot:
 
 
 @pytest.fixture
-def robot(tmp_path: Path, dds_domain: int, artifacts_dir: Path) -> Iterator[Robot]:
-    robot = Robot(tmp_path, dds_domain, artifacts_dir)
+def robot(tmp_path: Path, dds_domain: int, nano_dir: Path) -> Iterator[Robot]:
+    robot = Robot(tmp_path, dds_domain, nano_dir)
     hil = hil_arguments(dds_domain, "--people", 2, "--seed", 1, "--trace", robot.trace)
     bridge = ("--robot", GO2_SIM, "--socket", robot.socket, "--domain", dds_domain)
     with (
@@ -197,26 +197,26 @@ def test_a_terminal_that_takes_nothing_does_not_keep_a_signal_from_stopping_the_
     assert robot.moves()[-1][1], "the last command on the wire is zero velocity"
 
 
-def test_without_a_bridge_it_refuses(tmp_path: Path, artifacts_dir: Path, dds_domain: int) -> None:
-    done = run(*Robot(tmp_path, dds_domain, artifacts_dir).arguments("--duration", 1))
+def test_without_a_bridge_it_refuses(tmp_path: Path, nano_dir: Path, dds_domain: int) -> None:
+    done = run(*Robot(tmp_path, dds_domain, nano_dir).arguments("--duration", 1))
     assert done.returncode == 3
     assert "start `edge-bridge" in done.stderr.splitlines()[-1]
 
 
 @pytest.mark.slow
 def test_an_instruction_that_would_not_fit_with_four_frames_is_refused(
-    tmp_path: Path, artifacts_dir: Path, dds_domain: int
+    tmp_path: Path, nano_dir: Path, dds_domain: int
 ) -> None:
-    robot = Robot(tmp_path, dds_domain, artifacts_dir)
+    robot = Robot(tmp_path, dds_domain, nano_dir)
     done = run(*robot.arguments("--instruction", "0123456789" * 40))
     assert done.returncode == 2
     assert "shorten it" in done.stderr
 
 
-def test_artifacts_that_do_not_verify_are_refused_by_name(tmp_path: Path, artifacts_dir: Path) -> None:
+def test_artifacts_that_do_not_verify_are_refused_by_name(tmp_path: Path, nano_dir: Path) -> None:
     broken = tmp_path / "nano"
     broken.mkdir()
-    for path in artifacts_dir.iterdir():
+    for path in nano_dir.iterdir():
         (broken / path.name).write_bytes(path.read_bytes())
     (broken / "action_expert.onnx").write_bytes((broken / "action_expert.onnx").read_bytes()[:-1] + b"\x55")
     done = run(*Robot(tmp_path, 1, broken).arguments())

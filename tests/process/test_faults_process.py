@@ -44,12 +44,12 @@ def host() -> Iterator[HostStall]:
     ],
 )
 def test_a_wheeled_base_is_stopped_within_the_rows_bound(
-    robot: str, names: tuple[str, ...], artifacts_dir: Path, host: HostStall
+    robot: str, names: tuple[str, ...], nano_dir: Path, host: HostStall
 ) -> None:
     of = {row.name: row for row in rows(ROBOTS[robot])}
     with (
         socket_dir() as folder,
-        Rig(folder, artifacts_dir, None, print, record=False, stack_robot=ROBOTS[robot]) as rig,
+        Rig(folder, nano_dir, None, print, record=False, stack_robot=ROBOTS[robot]) as rig,
     ):
         rig.start()
         for name in names:
@@ -58,11 +58,11 @@ def test_a_wheeled_base_is_stopped_within_the_rows_bound(
 
 
 @pytest.fixture(scope="module")
-def rig(artifacts_dir: Path, dds_domain: int, host: HostStall) -> Iterator[Rig]:
+def rig(nano_dir: Path, dds_domain: int, host: HostStall) -> Iterator[Rig]:
     with socket_dir() as folder:
         # None of these rows is about the recording: they need no disk that has room for one.
         record = space_refusal(folder / "flight.mcap") is None
-        with Rig(folder, artifacts_dir, dds_domain, print, record=record) as rig:
+        with Rig(folder, nano_dir, dds_domain, print, record=record) as rig:
             rig.start()
             yield rig
 
@@ -87,10 +87,10 @@ def test_the_robot_is_stopped_within_the_rows_bound(name: str, rig: Rig, host: H
 
 
 @pytest.fixture(scope="module")
-def rover(artifacts_dir: Path, host: HostStall) -> Iterator[Rig]:
+def rover(nano_dir: Path, host: HostStall) -> Iterator[Rig]:
     with (
         socket_dir() as folder,
-        Rig(folder, artifacts_dir, None, print, record=False, stack_robot=ROBOTS["carter-mavlink"]) as rig,
+        Rig(folder, nano_dir, None, print, record=False, stack_robot=ROBOTS["carter-mavlink"]) as rig,
     ):
         rig.start()
         yield rig

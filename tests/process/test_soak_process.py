@@ -132,12 +132,12 @@ def patient(left_s: Callable[[Leg, int], float]) -> Callable[[Leg, int], float]:
 
 
 @pytest.fixture(scope="module")
-def soaked(artifacts_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Soaked:
+def soaked(nano_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Soaked:
     folder = tmp_path_factory.mktemp("soak")
     need_room_to_record(folder)
     faults = folder / "faults.toml"
     faults.write_text(FAULTS, encoding="utf-8")
-    arguments = ["--artifacts", str(artifacts_dir), "--duration", f"{DURATION_S}s", "--leg", "10m", "--scene", "office"]
+    arguments = ["--artifacts", str(nano_dir), "--duration", f"{DURATION_S}s", "--leg", "10m", "--scene", "office"]
     arguments += ["--people", "2", "--faults", str(faults), "--out", str(folder / "out"), "--json", "-"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Journey, "next", hurried(Journey.next))
@@ -266,9 +266,9 @@ def test_a_time_has_a_unit_or_is_in_seconds(text: str, seconds: float) -> None:
     ],
 )
 def test_bad_arguments_are_refused_before_anything_starts(
-    artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], change: list[str], named: str
+    nano_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], change: list[str], named: str
 ) -> None:
-    arguments = ["--artifacts", str(artifacts_dir), "--duration", "1m", "--out", str(tmp_path / "out"), *change]
+    arguments = ["--artifacts", str(nano_dir), "--duration", "1m", "--out", str(tmp_path / "out"), *change]
     assert cli.main(arguments) == 2
     error = capsys.readouterr().err
     assert named in error and error.count("\n") == 1 and not (tmp_path / "out").exists()
@@ -279,20 +279,20 @@ def test_invalid_artifacts_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_disk_too_full_to_record_to_is_refused_before_anything_starts(
-    artifacts_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    nano_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(os, "statvfs", lambda _path: FULL_DISK)
     out = tmp_path / "not yet" / "out"
-    assert cli.main(["--artifacts", str(artifacts_dir), "--duration", "1m", "--out", str(out)]) == 2
+    assert cli.main(["--artifacts", str(nano_dir), "--duration", "1m", "--out", str(out)]) == 2
     error = capsys.readouterr().err
     assert f"--out {out}: 61440 MiB" in error and error.count("\n") == 1 and not out.parent.exists()
 
 
 @pytest.mark.slow
-def test_ctrl_c_writes_the_report_of_the_finished_part(artifacts_dir: Path, tmp_path: Path) -> None:
+def test_ctrl_c_writes_the_report_of_the_finished_part(nano_dir: Path, tmp_path: Path) -> None:
     need_room_to_record(tmp_path)
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "sim_hil.soak.cli", "--artifacts", str(artifacts_dir), "--duration", "1h"]
+    command = [sys.executable, "-m", "sim_hil.soak.cli", "--artifacts", str(nano_dir), "--duration", "1h"]
     samples = out / "legs" / "001" / SAMPLES
     with subprocess.Popen([*command, "--scene", "office", "--people", "0", "--out", str(out)]) as process:
         try:

@@ -232,7 +232,8 @@ def test_a_manifest_has_defaults_of_the_switches(copy: Path, change: Edit, switc
     assert (runtime.decoding, runtime.recovery) == switches
 
 
-def test_an_older_export_is_refused_with_the_command_that_makes_it_again(copy: Path) -> None:
+def test_an_older_export_is_refused_with_the_command_that_makes_it_again(nano_dir: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(nano_dir, tmp_path / "nano"))
     edit_manifest(copy, version(3))
     command = f"edge-export --target cpu --model nano --out {copy}"
     with pytest.raises(ArtifactError, match=f"schema version 3, expected {SCHEMA_VERSION}; .*: {command}$"):

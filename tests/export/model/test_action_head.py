@@ -204,7 +204,7 @@ def trained(head: str, inputs: tuple[Tensor, ...], kv: Tensor, target: Tensor) -
     action.fit_actions(target)
     optimiser = torch.optim.AdamW(action.parameters(), lr=3e-3)
     generator = seeded(0)
-    for _ in range(250):
+    for _ in range(150):
         optimiser.zero_grad()
         errors(action, inputs, kv, target, generator).mean().backward()
         torch.nn.utils.clip_grad_norm_(action.parameters(), 1.0)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from edge.artifacts.manifest import Artifacts
+from edge.artifacts.manifest import load_artifacts
 from edge.inference.language import Generation, LanguageModel
 from edge.reasoning.prompt import Segment
 from export.cli import main
@@ -30,7 +30,7 @@ from tests.support.export.export_job import NANO, TARGET, job, manifest, progres
 
 GRAPHS = graph_names(pair=False)
 RANDOM = ("--random-weights", "0")
-"""What `artifacts_dir` was exported with."""
+"""What `nano_dir` was exported with."""
 
 
 @pytest.fixture(scope="module")
@@ -50,9 +50,9 @@ def verdict(name: str, found: ParityResult) -> str:
 # ---- the directory
 
 
-def test_the_directory_holds_what_the_design_lists(artifacts_dir: Path) -> None:
+def test_the_directory_holds_what_the_design_lists(nano_dir: Path) -> None:
     graphs = {f"{name}.onnx" for name in GRAPHS}
-    assert {p.name for p in artifacts_dir.iterdir()} == graphs | {
+    assert {p.name for p in nano_dir.iterdir()} == graphs | {
         "manifest.json",
         "tokenizer.json",
         "report.json",
@@ -61,8 +61,8 @@ def test_the_directory_holds_what_the_design_lists(artifacts_dir: Path) -> None:
 
 
 @pytest.mark.parametrize("name", GRAPHS)
-def test_every_graph_passed_the_gate_on_eight_inputs_and_on_the_task(artifacts_dir: Path, name: str) -> None:
-    parity, gate = manifest(artifacts_dir)["graphs"][name]["parity"], TARGET.gate(name)
+def test_every_graph_passed_the_gate_on_eight_inputs_and_on_the_task(nano_dir: Path, name: str) -> None:
+    parity, gate = manifest(nano_dir)["graphs"][name]["parity"], TARGET.gate(name)
     assert parity["verdict"] == "PASS"
     assert parity["inputs"] == 8
     assert parity["cosine"] >= gate.min_cosine
@@ -73,17 +73,17 @@ def test_every_graph_passed_the_gate_on_eight_inputs_and_on_the_task(artifacts_d
 
 
 @pytest.mark.parametrize("name", GRAPHS)
-def test_the_manifest_lists_a_graphs_files_and_session_options(artifacts_dir: Path, name: str) -> None:
-    graph = manifest(artifacts_dir)["graphs"][name]
-    assert graph["bytes"] == (artifacts_dir / graph["file"]).stat().st_size
+def test_the_manifest_lists_a_graphs_files_and_session_options(nano_dir: Path, name: str) -> None:
+    graph = manifest(nano_dir)["graphs"][name]
+    assert graph["bytes"] == (nano_dir / graph["file"]).stat().st_size
     assert graph["precision"] == {"default": "fp32", "overrides": {}}
     assert graph["precision_reason"]
     assert graph["session"] == {"provider": "CPUExecutionProvider", "options": {}, "threads": 1, "engine": False}
 
 
-def test_no_file_names_the_machine_it_was_made_on(artifacts_dir: Path) -> None:
-    for path in artifacts_dir.iterdir():
-        for place in (str(artifacts_dir), str(Path(__file__).parents[3]), str(Path.home()), "site-packages"):
+def test_no_file_names_the_machine_it_was_made_on(nano_dir: Path) -> None:
+    for path in nano_dir.iterdir():
+        for place in (str(nano_dir), str(Path(__file__).parents[3]), str(Path.home()), "site-packages"):
             assert place.encode() not in path.read_bytes()
 
 
@@ -98,9 +98,9 @@ def test_a_graph_that_ignores_its_input_fails(samples: dict[str, list[Sample]], 
 
 @pytest.mark.parametrize("dead", ["visual_tokens", "state", "latency", "context.0.key", "context.5.value"])
 def test_an_action_expert_that_ignores_one_of_its_inputs_fails(
-    samples: dict[str, list[Sample]], artifacts: Artifacts, dead: str
+    samples: dict[str, list[Sample]], nano_dir: Path, dead: str
 ) -> None:
-    graph = OpenGraph(artifacts, "action_expert", threads=1)
+    graph = OpenGraph(load_artifacts(nano_dir), "action_expert", threads=1)
     found = compare("action_expert", samples["action_expert"], lambda f: graph({**f, dead: np.zeros_like(f[dead])}))
     assert verdict("action_expert", found) == "FAIL"
 
@@ -171,23 +171,21 @@ def test_a_value_near_its_limit_is_a_warning_that_is_kept(tmp_path: Path, capsys
 
 
 @pytest.mark.slow
-def test_two_exports_of_the_same_weights_are_byte_identical_with_nothing_cached(
-    artifacts_dir: Path, tmp_path: Path
-) -> None:
+def test_two_exports_of_the_same_weights_are_byte_identical_with_nothing_cached(nano_dir: Path, tmp_path: Path) -> None:
     assert main([*RANDOM, "--out", str(tmp_path / "cold"), "--no-cache"]) == 0
-    subprocess.run(["diff", "-r", str(artifacts_dir), str(tmp_path / "cold")], check=True, timeout=300)
+    subprocess.run(["diff", "-r", str(nano_dir), str(tmp_path / "cold")], check=True, timeout=300)
     assert [path.name for path in tmp_path.iterdir()] == ["cold"]
 
 
 @pytest.mark.slow
-def test_a_cached_export_is_byte_identical_even_if_the_first_was_changed(artifacts_dir: Path, tmp_path: Path) -> None:
+def test_a_cached_export_is_byte_identical_even_if_the_first_was_changed(nano_dir: Path, tmp_path: Path) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
     assert main([*RANDOM, "--out", str(first)]) == 0
     data = bytearray((first / "action_expert.onnx").read_bytes())
     data[1000] ^= 1
     (first / "action_expert.onnx").write_bytes(data)
     assert main([*RANDOM, "--out", str(second)]) == 0
-    subprocess.run(["diff", "-r", str(artifacts_dir), str(second)], check=True, timeout=300)
+    subprocess.run(["diff", "-r", str(nano_dir), str(second)], check=True, timeout=300)
 
 
 def export_interrupted_by(number: signal.Signals, command: Sequence[str], stage: str) -> None:
@@ -213,7 +211,7 @@ def export_interrupted_by(number: signal.Signals, command: Sequence[str], stage:
 
 @pytest.mark.slow
 def test_an_interrupted_export_leaves_nothing_half_written_and_goes_on_where_it_was(
-    artifacts_dir: Path, tmp_path: Path
+    nano_dir: Path, tmp_path: Path
 ) -> None:
     cache, out = tmp_path / "cache", tmp_path / "out" / "nano"
     command = [sys.executable, "-m", "export.cli", *RANDOM, "--out", str(out), "--cache", str(cache)]
@@ -228,7 +226,7 @@ def test_an_interrupted_export_leaves_nothing_half_written_and_goes_on_where_it_
     assert "graph action_expert: from the cache" in done.stderr
     assert "gate vision_encoder: from the cache" in done.stderr
     assert done.stdout == ""
-    subprocess.run(["diff", "-r", str(artifacts_dir), str(out)], check=True, timeout=300)
+    subprocess.run(["diff", "-r", str(nano_dir), str(out)], check=True, timeout=300)
 
 
 @pytest.mark.slow

@@ -126,7 +126,6 @@ def resealed(directory: Path, keys: str, value: object) -> Path:
         ("model/name", "1b", 'model.name is "1b"'),
         ("model/trained", True, "model.trained is true, this export writes false"),
         ("model/config/action/step_s", 0.2, "step_s is 0.1, the network was built for 0.2"),
-        ("model/config/action/layers", 5, "model.config.action.layers is 5"),
         ("provenance/target/gates/action_expert/max_abs", 9.0, "gates.action_expert.max_abs is 9.0"),
         ("provenance/target/power/meter", "nvml", 'provenance.target.power.meter is "nvml"'),
         ("provenance/target/runtime/enforce_plan", True, "provenance.target.runtime.enforce_plan is true"),
@@ -147,6 +146,15 @@ def test_a_manifest_that_was_changed_and_sealed_again_does_not_verify(
     assert main(["verify", str(copy)]) == 1
     error = capsys.readouterr().err.splitlines()[-1]
     assert message in error
+
+
+@pytest.mark.slow
+def test_a_manifest_with_another_network_than_its_models_does_not_verify(
+    nano_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = resealed(Path(shutil.copytree(nano_dir, tmp_path / "nano")), "model/config/action/layers", 5)
+    assert main(["verify", str(copy)]) == 1
+    assert "model.config.action.layers is 5" in capsys.readouterr().err.splitlines()[-1]
 
 
 @pytest.mark.parametrize(("provider", "accepted"), [("CUDAExecutionProvider", True), ("CPUExecutionProvider", False)])

@@ -154,8 +154,8 @@ class Stack:
 
 
 @pytest.fixture
-def stack(tmp_path: Path, dds_domain: int, artifacts_dir: Path) -> Iterator[Stack]:
-    stack = Stack(tmp_path, dds_domain, artifacts_dir)
+def stack(tmp_path: Path, dds_domain: int, nano_dir: Path) -> Iterator[Stack]:
+    stack = Stack(tmp_path, dds_domain, nano_dir)
     hil = hil_arguments(dds_domain, "--people", 2, "--seed", 1, "--trace", stack.trace)
     bridge = ("--robot", GO2_SIM, "--socket", stack.bridge, "--domain", dds_domain)
     with (

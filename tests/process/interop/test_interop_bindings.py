@@ -39,14 +39,14 @@ def version(python: str) -> str:
 @pytest.mark.parametrize("robot_side", SIDES)
 @pytest.mark.parametrize("runner_side", SIDES)
 def test_a_run_drives_sees_and_ends_at_zero(
-    runner_side: str, robot_side: str, dds_domain: int, artifacts_dir: Path, tmp_path: Path
+    runner_side: str, robot_side: str, dds_domain: int, nano_dir: Path, tmp_path: Path
 ) -> None:
     runner_python, robot_python = SIDES[runner_side], SIDES[robot_side]
     versions = version(runner_python), version(robot_python)
     assert (versions[0] == versions[1]) == (runner_side == robot_side), f"the other binding is the same: {versions}"
     trace, result, socket = tmp_path / "trace.jsonl", tmp_path / "run.json", tmp_path / "bridge.sock"
     where = ("--robot", str(GO2_SIM), "--domain", str(dds_domain), "--socket", str(socket))
-    run = [runner_python, "-m", "edge.run.command", "--artifacts", str(artifacts_dir), *where]
+    run = [runner_python, "-m", "edge.run.command", "--artifacts", str(nano_dir), *where]
     run += ["--instruction", "walk down the corridor", "--duration", str(DRIVE_S), "--json", str(result)]
     hil = hil_arguments(dds_domain, "--trace", trace)
     with (

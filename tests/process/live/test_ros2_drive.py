@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.process, pytest.mark.slow]
 
 
 @pytest.fixture
-def arguments(tmp_path: Path, dds_domain: int, artifacts_dir: Path) -> Iterator[list[str]]:
+def arguments(tmp_path: Path, dds_domain: int, nano_dir: Path) -> Iterator[list[str]]:
     """Arguments of an edge-run whose robot file publishes, with its robot and bridge running."""
     file, socket = tmp_path / "robot.toml", tmp_path / "b.sock"
     file.write_text(f'{GO2_SIM.read_text()}\n[ros2]\npublish = true\npublish_namespace = "/watch"\n')
@@ -30,7 +30,7 @@ def arguments(tmp_path: Path, dds_domain: int, artifacts_dir: Path) -> Iterator[
         running("sim_hil.hil.command", *hil_arguments(dds_domain), folder=tmp_path),
         running("firmware_bridge.bridge", *where, folder=tmp_path),
     ):
-        yield ["--artifacts", str(artifacts_dir), "--instruction", "walk down the corridor", *where]
+        yield ["--artifacts", str(nano_dir), "--instruction", "walk down the corridor", *where]
 
 
 def start(arguments: list[str]) -> subprocess.Popen[str]:

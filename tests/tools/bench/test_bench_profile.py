@@ -11,9 +11,9 @@ from tools.bench.profile import main
 
 
 @pytest.mark.slow
-def test_every_graph_is_profiled_by_operator(artifacts_dir: Path, tmp_path: Path) -> None:
+def test_every_graph_is_profiled_by_operator(nano_dir: Path, tmp_path: Path) -> None:
     out = tmp_path / "profile.json"
-    assert main(["--artifacts", str(artifacts_dir), "--context", "200", "--threads", "1", "--json", str(out)]) == 0
+    assert main(["--artifacts", str(nano_dir), "--context", "200", "--threads", "1", "--json", str(out)]) == 0
     found = json.loads(out.read_text())
     assert set(found) == {"vision_encoder", "language_model", "semantic_context", "action_expert"}
     layers = 4
@@ -25,7 +25,7 @@ def test_every_graph_is_profiled_by_operator(artifacts_dir: Path, tmp_path: Path
 @pytest.mark.slow
 @pytest.mark.parametrize("wrong", [["--graphs", "nothing"], ["--context", "0"], ["--context", "9999"]])
 def test_a_graph_that_cannot_be_profiled_is_one_line(
-    artifacts_dir: Path, wrong: list[str], capsys: pytest.CaptureFixture[str]
+    nano_dir: Path, wrong: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["--artifacts", str(artifacts_dir), *wrong]) == 2
+    assert main(["--artifacts", str(nano_dir), *wrong]) == 2
     assert capsys.readouterr().err.count("\n") == 1

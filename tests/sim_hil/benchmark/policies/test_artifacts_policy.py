@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from edge.artifacts.files import ArtifactError
-from edge.artifacts.manifest import Artifacts
+from edge.artifacts.manifest import Artifacts, load_artifacts
 from edge.core.geometry import SE2
 from edge.flightlog.part import encode
 from edge.flightlog.schemas import SCHEMAS
@@ -35,12 +35,12 @@ Rows = list[tuple[tuple[float, float, float], dict[str, Any]]]
 
 
 @pytest.fixture(scope="module")
-def policies(artifacts_dir: Path) -> Iterator[dict[str, ArtifactsPolicy]]:
+def policies(nano_dir: Path) -> Iterator[dict[str, ArtifactsPolicy]]:
     """One opened policy a mode, with the latency that the test of it expects."""
     asked = {"async": 0.5, "sync": 0.5, "no-reasoning": 0.2}
     robot = robot_config()
     opened = {
-        mode: ArtifactsPolicy(artifacts_dir, mode=mode, latency=LatencyProfile.constant(latency_s), robot=robot)
+        mode: ArtifactsPolicy(nano_dir, mode=mode, latency=LatencyProfile.constant(latency_s), robot=robot)
         for mode, latency_s in asked.items()
     }
     yield opened
@@ -74,8 +74,8 @@ def drive(policy: ArtifactsPolicy, ticks: int, *, step_m: float = 0.05, seed: in
     return rows
 
 
-def test_graphs_that_the_self_test_cannot_prove_are_refused(artifacts_dir: Path, tmp_path: Path) -> None:
-    copy = Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))
+def test_graphs_that_the_self_test_cannot_prove_are_refused(nano_dir: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(nano_dir, tmp_path / "nano"))
     edit_manifest(copy, lambda manifest: manifest.update(self_test={}))
     with pytest.raises(ArtifactError, match="no known answers for the self-test; export again"):
         ArtifactsPolicy(copy, mode="async", latency=LatencyProfile.constant(0.5), robot=robot_config())
@@ -158,9 +158,9 @@ def by_calls(directory: Path, speculation: Speculation = Speculation.ON) -> Arti
 
 
 @pytest.fixture(scope="module")
-def guessing(artifacts_dir: Path) -> ArtifactsPolicy:
+def guessing(nano_dir: Path) -> ArtifactsPolicy:
     """A policy whose latency depends on the calls of its texts."""
-    return by_calls(artifacts_dir)
+    return by_calls(nano_dir)
 
 
 def test_a_generation_takes_the_time_of_the_calls_that_its_text_takes(guessing: ArtifactsPolicy) -> None:
@@ -173,10 +173,8 @@ def test_a_generation_takes_the_time_of_the_calls_that_its_text_takes(guessing: 
 
 
 @pytest.mark.slow
-def test_without_guesses_each_token_of_the_same_text_costs_a_call(
-    artifacts_dir: Path, guessing: ArtifactsPolicy
-) -> None:
-    plain = by_calls(artifacts_dir, Speculation.OFF)
+def test_without_guesses_each_token_of_the_same_text_costs_a_call(nano_dir: Path, guessing: ArtifactsPolicy) -> None:
+    plain = by_calls(nano_dir, Speculation.OFF)
     for policy in (plain, guessing):
         drive(policy, 12)
     expected, found = plain.generations()[0], guessing.generations()[0]
@@ -205,14 +203,14 @@ def test_a_device_that_guesses_nothing_takes_one_call_a_token(
 
 @pytest.mark.slow
 def test_more_rows_than_this_machine_computes_exactly_are_refused(
-    artifacts_dir: Path, monkeypatch: pytest.MonkeyPatch
+    nano_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(model: LanguageModel) -> str:
         return "no equal bits"
 
     monkeypatch.setattr(LanguageModel, "speculate", refuse)
     with pytest.raises(ArtifactError, match="up to 16 rows, this machine computes at most 1"):
-        by_calls(artifacts_dir)
+        by_calls(nano_dir)
 
 
 @pytest.mark.slow
@@ -234,9 +232,9 @@ def asked(directory: Path, **changed: Any) -> Conditions:
 
 
 @pytest.mark.slow
-def test_a_worker_refuses_artifacts_that_are_not_those_of_the_run(artifacts_dir: Path) -> None:
+def test_a_worker_refuses_artifacts_that_are_not_those_of_the_run(nano_dir: Path) -> None:
     with pytest.raises(ArtifactError, match="expected the artifacts that started this run"):
-        open_policy(asked(artifacts_dir), manifest_sha256="0" * 64)
+        open_policy(asked(nano_dir), manifest_sha256="0" * 64)
 
 
 def test_artifacts_that_are_none_are_refused_before_any_episode(tmp_path: Path) -> None:
@@ -244,22 +242,23 @@ def test_artifacts_that_are_none_are_refused_before_any_episode(tmp_path: Path) 
         check_artifacts(asked(tmp_path))
 
 
-def test_the_world_renders_the_models_camera(policies: dict[str, ArtifactsPolicy], artifacts_dir: Path) -> None:
-    assert camera_for(asked(artifacts_dir), policies["async"]) == (128, 128)
+def test_the_world_renders_the_models_camera(policies: dict[str, ArtifactsPolicy], nano_dir: Path) -> None:
+    assert camera_for(asked(nano_dir), policies["async"]) == (128, 128)
     with pytest.raises(ConditionsError, match="needs 128x128"):
-        camera_for(asked(artifacts_dir, camera="320x180"), policies["async"])
+        camera_for(asked(nano_dir, camera="320x180"), policies["async"])
 
 
-def test_a_variant_is_its_own_sub_directory_or_the_artifacts_themselves(artifacts_dir: Path, tmp_path: Path) -> None:
-    (tmp_path / "rl").symlink_to(artifacts_dir, target_is_directory=True)
+def test_a_variant_is_its_own_sub_directory_or_the_artifacts_themselves(nano_dir: Path, tmp_path: Path) -> None:
+    (tmp_path / "rl").symlink_to(nano_dir, target_is_directory=True)
     assert artifact_directory(tmp_path, "rl") == tmp_path / "rl"
-    assert artifact_directory(artifacts_dir, "full") == artifacts_dir
+    assert artifact_directory(nano_dir, "full") == nano_dir
     with pytest.raises(ConditionsError, match="--variant il: expected"):
         artifact_directory(tmp_path, "il")
 
 
 @pytest.mark.parametrize("variant", sorted(set(VARIANTS) - {"full"}))
-def test_a_variant_that_the_model_is_not_is_refused(artifacts: Artifacts, variant: str) -> None:
+def test_a_variant_that_the_model_is_not_is_refused(nano_dir: Path, variant: str) -> None:
+    artifacts = load_artifacts(nano_dir)
     check_variant(artifacts, "full")
     with pytest.raises(ConditionsError, match=f"--variant {variant}: expected a model with"):
         check_variant(artifacts, variant)
