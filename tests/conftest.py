@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import Phase, settings
 
 from edge.artifacts.manifest import Artifacts, load_artifacts
+from edge.core.cli import write_whole
 from export.core.cache import StageCache, open_cache
 from tests.support.processes import claimed_dds_domain, locked
 
@@ -64,30 +65,32 @@ def cache(export_cache: Path) -> Iterator[StageCache]:
 @pytest.fixture(scope="session")
 def nano_dir(run_folder: Path) -> Path:
     """The `nano` artifacts, exported by the real command: once in a run, by the worker that needs them first."""
-    return _exported(run_folder, "nano", lambda: "nano")
+    return _exported(run_folder, "nano", "nano")
 
 
 @pytest.fixture(scope="session")
-def artifacts_dir(run_folder: Path) -> Path:
-    """The same of a narrow network with nano's inputs and texts: 1.8 MB, so its hashes cost a test next to nothing."""
+def narrow_model(run_folder: Path) -> Path:
+    """Configuration of a narrow network with nano's inputs and texts."""
+    from tools.train.config.recipe import load_recipe
 
-    def narrow() -> str:
-        from tools.train.config.recipe import load_recipe
-
-        file = run_folder / "narrow.json"
-        file.write_text(json.dumps(load_recipe("tiny").model.to_dict()))
-        return str(file)
-
-    return _exported(run_folder, "narrow", narrow)
+    file = run_folder / "narrow.json"
+    write_whole(file, json.dumps(load_recipe("tiny").model.to_dict()))
+    return file
 
 
-def _exported(run_folder: Path, name: str, model: Callable[[], str]) -> Path:
+@pytest.fixture(scope="session")
+def artifacts_dir(run_folder: Path, narrow_model: Path) -> Path:
+    """Artifacts of the narrow network: 1.8 MB, so that their hashes cost a test next to nothing."""
+    return _exported(run_folder, "narrow", str(narrow_model))
+
+
+def _exported(run_folder: Path, name: str, model: str) -> Path:
     out = run_folder / "artifacts" / name
     with locked(run_folder / "artifacts.lock", wait=True):
         if not out.exists():
             from export.cli import main  # here: it loads torch, which those who find the artifacts do without
 
-            assert main(["--target", "cpu", "--model", model(), "--random-weights", "0", "--out", str(out)]) == 0
+            assert main(["--target", "cpu", "--model", model, "--random-weights", "0", "--out", str(out)]) == 0
     return out
 
 

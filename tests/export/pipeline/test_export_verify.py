@@ -197,21 +197,29 @@ def test_another_tokenizer_does_not_verify_although_the_manifest_vouches_for_it(
     assert "tokenizer.json: not the tokenizer" in capsys.readouterr().err
 
 
+@pytest.fixture
+def narrow(narrow_model: Path) -> list[str]:
+    """Arguments for the narrow network of `artifacts_dir`."""
+    return ["--model", str(narrow_model), "--random-weights", "0"]
+
+
 @pytest.mark.slow
-def test_changed_thresholds_are_kept_and_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_changed_thresholds_are_kept_and_printed(
+    narrow: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     setting = "gates.action_expert.max_abs=0.5"
-    assert main(["--out", str(tmp_path / "nano"), "--set", setting]) == 0
+    assert main([*narrow, "--out", str(tmp_path / "nano"), "--set", setting]) == 0
     assert main(["verify", str(tmp_path / "nano")]) == 0
     assert f"note: thresholds were changed with --set for this build: {setting}" in capsys.readouterr().err
 
 
 @pytest.mark.slow
 def test_a_directory_for_a_users_target_names_the_origin_of_its_thresholds(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    narrow: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     own = tmp_path / "own.toml"
     own.write_text((TARGETS_DIR / "cpu.toml").read_text())
-    assert main(["--target", str(own), "--out", str(tmp_path / "nano")]) == 0
+    assert main([*narrow, "--target", str(own), "--out", str(tmp_path / "nano")]) == 0
     assert main(["verify", str(tmp_path / "nano")]) == 0
     assert "checked against the thresholds in the manifest" in capsys.readouterr().err
 
