@@ -11,7 +11,6 @@ import pytest
 from hypothesis import Phase, settings
 
 from edge.artifacts.manifest import Artifacts, load_artifacts
-from edge.core.cli import write_whole
 from export.core.cache import StageCache, open_cache
 from tests.support.processes import claimed_dds_domain, locked
 
@@ -74,7 +73,9 @@ def narrow_model(run_folder: Path) -> Path:
     from tools.train.config.recipe import load_recipe
 
     file = run_folder / "narrow.json"
-    write_whole(file, json.dumps(load_recipe("tiny").model.to_dict()))
+    with locked(run_folder / "artifacts.lock", wait=True):
+        if not file.exists():
+            file.write_text(json.dumps(load_recipe("tiny").model.to_dict()), encoding="utf-8")
     return file
 
 
