@@ -40,7 +40,7 @@ help:
 	@echo "make faults inject faults into real processes, some 250 times (about 15 min), and write out/faults/"
 	@echo "make faults PER_ROW=20 LOAD=2  each fault 20 times beside two busy processes; resumes; the table: python -m tools.faults --table out/faults"
 	@echo "make contract  faults of link, bridge and runner on every robot, 20 times each, into out/contract/ (an hour; resumes)"
-	@echo "make test   lint, type-check and run the fast tests (4 to 5 min on 2 cores)"
+	@echo "make test   lint, type-check and run the fast tests (4 to 9 min on 2 cores)"
 	@echo "make test-all     lint, type-check and run every test (15 to 30 min on 2 cores)"
 	@echo "make test-slow    the tests that 'make test' leaves out"
 	@echo "make test-random  the property tests with a random seed, which is printed; SEED=N repeats one"

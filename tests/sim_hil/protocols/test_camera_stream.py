@@ -1,4 +1,4 @@
-"""The camera over HTTP: pictures for whoever looks, none for nobody, and an end when its parent ends."""
+"""The camera over HTTP: it renders only while a client waits, and ends with its parent."""
 
 from __future__ import annotations
 
