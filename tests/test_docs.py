@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from sim_hil.benchmark.results.compare import compared
 from sim_hil.benchmark.results.store import read_results
 from sim_hil.benchmark.results.summary import summarise
 
@@ -22,6 +23,7 @@ else:
     import tomli as tomllib
 
 ROOT = next(folder for folder in Path(__file__).resolve().parents if (folder / "pyproject.toml").is_file())
+RUNS = ROOT / "docs/runs"
 PAGES = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md")))
 FOLDERS = sorted({"docs", "tests", *(path.parent.name for path in ROOT.glob("*/__init__.py"))})
 NESTED = {"edge-install", "edge-calib", "edge-bench", "edge-replay"}
@@ -160,10 +162,21 @@ def test_every_option_beside_a_command_is_in_its_help(
 
 
 def test_the_published_run_has_the_rates_of_its_page() -> None:
-    rates = summarise(read_results(ROOT / "docs/runs/dynanav-fresh-nano"))
+    rates = summarise(read_results(RUNS / "dynanav-fresh-nano"))
     sr, cr = (f"{rates[key]:.1f} ({' to '.join(f'{end:.1f}' for end in rates[f'{key}_ci95'])})" for key in ("sr", "cr"))
     row = f"| {rates['episodes']} | {rates['episodes'] * rates['sr'] / 100:.0f} | {sr} | {rates['spl']:.1f} | {cr} |"
     assert row in (ROOT / "docs/results.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("run", sorted(RUNS.glob("dynanav-fresh-nano-*")), ids=lambda run: run.name)
+def test_a_published_run_under_another_condition_differs_as_its_page_says(run: Path) -> None:
+    found = compared(RUNS / "dynanav-fresh-nano", run)
+    cells = [str(found["episodes"])]
+    for rate in (found["differences"]["sr"], found["differences"]["cr"]):
+        after, before = (f"{found['episodes'] * rate[key] / 100:.0f}" for key in ("after", "before"))
+        low, high = rate["ci95"]
+        cells += [f"{after} instead of {before}", f"{rate['difference']:+.1f} ({low:+.1f} to {high:+.1f})"]
+    assert f"| {' | '.join(cells)} |" in (ROOT / "docs/results.md").read_text(encoding="utf-8")
 
 
 def test_the_readme_stays_short() -> None:
