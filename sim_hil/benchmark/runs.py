@@ -61,7 +61,7 @@ class BenchRun:
 
     @staticmethod
     def plan(suite: str, episodes: Sequence[Episode], conditions: Conditions, first: int | None = None) -> BenchRun:
-        """Check everything that is known before the first episode; connect once to an external policy.
+        """Check everything that is known before the first episode; open an external policy or a network's file once.
 
         Raises ArtifactError, ConditionsError, ExternalError.
         """

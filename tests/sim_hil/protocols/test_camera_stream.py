@@ -75,14 +75,15 @@ def test_an_image_is_rendered_after_its_request_and_has_a_stamp(studio: Studio) 
 def test_an_image_whose_rendering_began_before_the_request_is_not_its_answer(studio: Studio) -> None:
     studio.hold.set()
     began_ns = time.monotonic_ns()
-    waiting = ThreadPoolExecutor(1).submit(lambda: studio.get("/frame.jpg").read())
-    deadline = time.monotonic() + 10
-    while not studio.shutter.wanted:
-        assert time.monotonic() < deadline
-        time.sleep(0.001)
-    studio.shutter.show(began_ns, b"of an earlier request")
-    studio.hold.clear()
-    assert waiting.result(10).startswith(b"picture")
+    with ThreadPoolExecutor(1) as client:
+        answer = client.submit(lambda: studio.get("/frame.jpg").read())
+        deadline = time.monotonic() + 10
+        while not studio.shutter.wanted:
+            assert time.monotonic() < deadline
+            time.sleep(0.001)
+        studio.shutter.show(began_ns, b"of an earlier request")
+        studio.hold.clear()
+        assert answer.result(10).startswith(b"picture")
 
 
 def test_a_stream_is_one_new_picture_after_another(studio: Studio) -> None:
