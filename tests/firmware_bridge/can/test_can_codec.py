@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
 import math
+import operator
 
 import cantools
 import pytest
@@ -78,6 +81,16 @@ def test_a_crc_has_its_published_check_value(crc: Crc, check: int) -> None:
 @given(st.binary(max_size=12), st.integers(0, 255), st.integers(0, 255), st.integers(0, 255))
 def test_a_crc_is_the_one_computed_bit_by_bit(data: bytes, polynomial: int, initial: int, final_xor: int) -> None:
     assert Crc(8, polynomial, initial, final_xor).of(data) == crc_bit_by_bit(data, polynomial, initial, final_xor)
+
+
+@pytest.mark.parametrize(("polynomial", "flips"), [(0x1D, 2), (0x2F, 3)])
+def test_every_error_of_so_few_flipped_bits_in_8_bytes_changes_the_crc(polynomial: int, flips: int) -> None:
+    crc = Crc(8, polynomial, 0xFF, 0xFF)
+    # Bits 0 to 55 are data; a flip of a bit of the CRC itself, 56 to 63, changes only that bit.
+    changes = [crc.of((1 << bit).to_bytes(7, "little")) ^ crc.of(bytes(7)) for bit in range(56)]
+    changes += [1 << bit for bit in range(8)]
+    for count in range(1, flips + 1):
+        assert all(functools.reduce(operator.xor, chosen) for chosen in itertools.combinations(changes, count))
 
 
 @pytest.mark.slow
