@@ -14,9 +14,10 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import deque
 from dataclasses import dataclass
-from math import atan2, copysign, hypot
+from math import atan2, copysign, hypot, pi
 from typing import Final
 
 import numpy as np
@@ -143,6 +144,7 @@ class BackOff:
             times = min(self._tries, self._config.further)
             self._retreat = _Retreat(T_odom_base, now_ns, times, T_odom_base, now_ns)
             self._stuck_at = self._stuck_at or T_odom_base
+            self._forget_before_a_turn_about(T_odom_base)
         back = self._drive_back(self._retreat, command, T_odom_base, now_ns, speed_mps, scale)
         if back is None:
             self._end(T_odom_base)
@@ -168,6 +170,17 @@ class BackOff:
         self._commanded = _Commanded(pose)  # each stretch is judged alone, so that a freed robot is not stuck
         moved_m = distance_m(commanded.start, pose)
         return moved_m < config.share * commanded.distance_m and self._failures < config.failures
+
+    def _forget_before_a_turn_about(self, pose: SE2) -> None:
+        """Shorten the trail to what was driven since a turn of more than 90°: the way before that lies ahead."""
+        poses = list(reversed(self._trail))
+        kept = list(
+            itertools.takewhile(lambda each: abs(wrap_angle(each[1].theta_rad - pose.theta_rad)) <= pi / 2, poses)
+        )
+        if len(kept) < len(poses):
+            while len(kept) > 1 and distance_m(kept[-1][1], kept[-2][1]) < _TRAIL_M / 2:
+                kept.pop()  # of a turn on the spot only its end is a heading in which the robot drove
+        self._trail = deque(reversed(kept), maxlen=_TRAIL_POSES)
 
     def _end(self, pose: SE2 | None) -> None:
         if self._retreat is not None:

@@ -134,7 +134,9 @@ class SemanticSlot:
         return None if turn is self._made else turn
 
     def tell(self, turn: ToldTurn | None) -> None:
-        """Replace the turn."""
+        """Replace the turn; where one was under way, nothing from before it drives the robot."""
+        if self.turn is not None:
+            self.state = None
         self._told = turn
 
     def end(self, turn: ToldTurn) -> None:

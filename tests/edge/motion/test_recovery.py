@@ -11,7 +11,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from edge.core.geometry import SE2
+from edge.core.geometry import SE2, wrap_angle
 from edge.motion.controller import VelocityCommand
 from edge.motion.recovery import BACKING_OFF, TURNING, BackOff, BackOffConfig, StandstillConfig, StandstillTurn
 from edge.state.semantic import waypoints_now
@@ -120,6 +120,25 @@ def test_it_goes_back_through_the_poses_that_it_came_by() -> None:
         ]
         assert any(gap_m < 0.08 and turned < 0.25 for gap_m, turned in gaps)
     assert run.poses[-2].theta_rad < start.theta_rad - 0.2
+
+
+TURNS = VelocityCommand(0.0, 0.0, 0.5, SE2(-0.4, 0.01, pi), "ok")
+
+
+@pytest.mark.parametrize("since_m", [0.0, 0.1, 0.2, 0.6])
+def test_after_a_turn_about_it_neither_turns_back_nor_reverses_the_way_it_first_came(since_m: float) -> None:
+    run = Run(BackOff(BACK))
+    run.go(50)
+    while abs(run.pose.theta_rad) < pi - 0.05:
+        run.go(1, TURNS)
+    turned = run.pose
+    run.moves = lambda pose, command: (
+        pose if command.vx_mps and glide(pose, command).x_m < 2.0 - since_m else glide(pose, command)
+    )
+    run.go(600)
+    assert max(abs(wrap_angle(pose.theta_rad - turned.theta_rad)) for pose in run.poses[-600:]) < 0.1
+    assert max(pose.x_m for pose in run.poses[-600:]) <= 2.0 + 0.03
+    assert (BACKING_OFF in run.reasons) == (since_m > 0.0)
 
 
 def only_back(pose: SE2, command: VelocityCommand) -> SE2:

@@ -254,6 +254,9 @@ def test_a_text_that_is_published_during_a_turn_drives_neither_then_nor_after_it
 
 
 def test_another_instruction_ends_a_turn_that_is_under_way(bench: Bench) -> None:
+    bench.see()
+    bench.think(0)
+    assert bench.tick()[1] == "ok"
     bench.slot.tell(ToldTurn(math.pi))
     bench.see()
     assert bench.tick()[1] == TOLD
