@@ -41,6 +41,7 @@ from edge.deploy.releases import (
     Release,
     ReleaseError,
     check_owner,
+    current_text,
     home_argument,
     locked,
     read_home,
@@ -165,7 +166,7 @@ def run(args: argparse.Namespace, say: Say, board: Board | None = None) -> int:
         say(_file_error(error, args.home))
         return EXIT_CHECK_FAILED if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) else EXIT_BAD_INPUT
     except KeyboardInterrupt:
-        say("interrupted; the current release is unchanged, run it again")
+        say(f"interrupted; {current_text(args.home)}, run it again")
         return EXIT_INTERRUPTED
     finally:
         os.umask(before)
@@ -174,7 +175,7 @@ def run(args: argparse.Namespace, say: Say, board: Board | None = None) -> int:
 def _file_error(error: OSError, home: Path) -> str:
     where = error.filename or home
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return f"{where}: the disk is full; the current release is unchanged; free some space and run it again"
+        return f"{where}: the disk is full; {current_text(home)}; free some space and run it again"
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return f"{where}: {error.strerror}; run it with sudo, or give a folder of yours with --home"
     return f"{where}: {error.strerror or error}"
@@ -304,7 +305,7 @@ def _do(steps: Sequence[Step], say: Say, disk: Disk, home: Home, unfinished: int
         log = layout.home / LOG
         with contextlib.suppress(OSError):  # a full disk; the first line says what failed
             disk.write(log, output + "\n")
-        raise CommandError(error.code, f"{first}; the current release is unchanged; all output: {log}") from None
+        raise CommandError(error.code, f"{first}; {current_text(layout.home)}; all output: {log}") from None
     except (ArtifactError, OSError, KeyboardInterrupt):
         _remove_unfinished(disk, home, unfinished)
         raise

@@ -188,6 +188,15 @@ def _current(layout: Layout) -> int | None:
     return number
 
 
+def current_text(path: Path) -> str:
+    """Return which release the link leads to now, for a message of a call that was cut off."""
+    try:
+        current = _current(Layout(path))
+    except (ReleaseError, OSError):
+        return f"{Layout(path).link} cannot be read"
+    return "no release is current" if current is None else f"release {current} is current"
+
+
 def _number(name: str) -> int | None:
     """Return the number of a release's folder; None for a name that no release has."""
     return int(name) if name.isascii() and name.isdecimal() and str(int(name)) == name else None

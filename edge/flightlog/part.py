@@ -97,6 +97,11 @@ class LogPart:
         self._writer.add_metadata("clock", clock)
         self._writer.add_metadata("part", {"number": str(number)})
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether no record was added."""
+        return not self._channels
+
     def has(self, topic: str) -> bool:
         """Whether a record of that topic was added."""
         return topic in self._channels

@@ -21,6 +21,7 @@ import os
 import threading
 import time
 from collections import Counter, deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -84,9 +85,21 @@ class Recorder:
     pictures by one thread.
     """
 
-    def __init__(self, path: str | Path, limits: RecorderLimits | None = None) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        limits: RecorderLimits | None = None,
+        *,
+        from_run: bool = False,
+        say: Callable[[str], None] = lambda _line: None,
+    ) -> None:
+        """`from_run`: nothing before the `/run` record is kept, however long the robot waits to be armed.
+
+        `say` takes a line where recording pauses, goes on or stops; must not wait or raise.
+        """
         self.path = Path(path)
         self._limits = limits or RecorderLimits()
+        self._begun, self._say = not from_run, say
         self._queue: deque[_Item] = deque()
         self._refused: dict[str, int] = {}  # by `put`
         self._picture_bytes_in = 0  # by `put`
@@ -98,17 +111,23 @@ class Recorder:
         self._unsaved: Counter[str] = Counter()  # taken from the queue since the last flush
         self._error: str | None = None
         self._paused: str | None = None
+        self.was_paused = False
+        """Whether records were dropped because the disk was nearly full."""
         self._closing = threading.Event()
         self._run_item: _Item | None = None
         self._finished: list[tuple[Path, int]] = []
         self._discarded = 0
         self._number = 1
         self._part: LogPart | None = None
+        self._made = False
         file: PartFile | None = None
         try:
             if len(parts(self.path)) > 1:
                 raise FileExistsError(errno.EEXIST, f"{parts(self.path)[-1].name} of another recording lies beside it")
-            file = PartFile(self.path, new=False)
+            # A device or a pipe is there before; a file is never overwritten.
+            new = not self.path.exists() or self.path.is_file()
+            file = PartFile(self.path, new=new)
+            self._made = new
         except OSError as error:
             self._ended = True
             self._error = f"cannot open {self.path} for recording: {error.strerror or error}"
@@ -153,6 +172,10 @@ class Recorder:
         """
         size = len(payload) if isinstance(payload, bytes) else 0
         limits = self._limits
+        if not self._begun:
+            if topic != _RUN_TOPIC:
+                return
+            self._begun = True
         full = len(self._queue) >= limits.records or (
             size > 0 and self._picture_bytes_in + size - self._picture_bytes_out > limits.picture_bytes
         )
@@ -173,6 +196,11 @@ class Recorder:
                 self._fail(f"{self.path} was not finished within {timeout_s:g} s; its last second may be missing")
         return self.error is None
 
+    def discard(self) -> None:
+        """Delete the file of a run that did not begin, after `close`; another's file stays."""
+        if self._made:
+            self.path.unlink(missing_ok=True)
+
     def _take(self) -> _Item | None:
         with self._lock:
             try:
@@ -192,6 +220,7 @@ class Recorder:
             self._error = self._error or message
             self._lost.update(self._unsaved)
             self._unsaved.clear()
+        self._say(message)
 
     def _drop_taken(self, topic: str) -> None:
         with self._lock:
@@ -245,7 +274,9 @@ class Recorder:
                 self._all_saved()
                 self._check_space()
                 flushed_ns = now_ns
-                if now_ns - begun_ns >= _PART_AGE_NS:
+                if part.is_empty or self._paused is not None:
+                    begun_ns = now_ns  # its index does not grow, and a full disk could take no other part
+                elif now_ns - begun_ns >= _PART_AGE_NS:
                     part, begun_ns = self._next_part(part), now_ns
             if closing and not self._queue:
                 part.finish()
@@ -261,6 +292,7 @@ class Recorder:
                 encode(payload, stamp_ns)  # every part begins with it, so it must be encodable
                 self._run_item = item
             if self._paused is not None:
+                self.was_paused = True
                 self._drop_taken(topic)
                 return
             if self._run_item is not None and self._run_item is not item and not part.has(_RUN_TOPIC):
@@ -298,7 +330,14 @@ class Recorder:
                 f"{floor / 2**20:.0f} MiB are left to others; delete old logs"
             )
         with self._lock:
-            self._paused = paused
+            before, self._paused = self._paused, paused
+        if (before is None) != (paused is None):
+            self._say(paused or f"recording to {self.path} goes on")
+
+
+def arming_free_bytes(total_bytes: int, limits: RecorderLimits | None = None) -> int:
+    """Return the free bytes below which a robot that records to a file system of this size is not armed."""
+    return max((limits or RecorderLimits()).free_bytes, round(ARMING_FREE_SHARE * total_bytes))
 
 
 def space_refusal(path: Path, limits: RecorderLimits | None = None) -> str | None:
@@ -306,7 +345,7 @@ def space_refusal(path: Path, limits: RecorderLimits | None = None) -> str | Non
     free = _free(path)
     if free is None:
         return None
-    floor = max((limits or RecorderLimits()).free_bytes, round(ARMING_FREE_SHARE * free[1]))
+    floor = arming_free_bytes(free[1], limits)
     if free[0] >= floor:
         return None
     return (

@@ -42,14 +42,15 @@ def close_log(recorder: Recorder, result: dict[str, Any] | None, *, began: bool,
     """Finish the flight log within `left_s`, add its statistics to the result, return a line on what it lacks."""
     recorder.close(left_s)
     if not began:
-        recorder.path.unlink(missing_ok=True)  # an empty log would mislead
+        recorder.discard()  # an empty log would mislead
         return None
     dropped = sum(recorder.dropped.values())
     if result is not None:
         result["recorder"] = recorder.statistics()
     if recorder.error is not None:
         return f"the flight log is incomplete: {recorder.error}"
-    return f"the flight log lacks {dropped} records: writing was slower than the run" if dropped else None
+    why = "its disk was nearly full; delete old logs" if recorder.was_paused else "writing was slower than the run"
+    return f"the flight log lacks {dropped} records: {why}" if dropped else None
 
 
 def run_result(

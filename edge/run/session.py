@@ -166,7 +166,7 @@ class RunSession:
             views.open(self._options.live, self._robot, functools.partial(stop, LIVE_STOP), self._print)
             self._await_inputs(inputs, bridge, views)
             if self._options.record is not None:
-                recorder = Recorder(self._options.record)
+                recorder = Recorder(self._options.record, from_run=True, say=self._lines.append)
                 if recorder.error is not None:
                     raise RefusedError(recorder.error)
             views.watch(recorder)

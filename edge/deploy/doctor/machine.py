@@ -14,7 +14,7 @@ from edge.core.device import DeviceError, check_power_mode, l4t_release
 from edge.core.sysfs import read_int
 from edge.deploy import boot
 from edge.deploy.doctor.check import Check, Level, skipped
-from edge.flightlog.recorder import ARMING_FREE_SHARE
+from edge.flightlog.recorder import arming_free_bytes
 
 SPARE_MEMORY: Final = 1.2
 """Multiple of the plan's memory below which the free memory gives a warning."""
@@ -247,10 +247,10 @@ def disk(folder: Path, usage: Callable[[Path], tuple[int, int]]) -> Check:
         free, total = usage(folder)
     except OSError as error:
         return Check(name, Level.FAIL, f"{folder}: {error.strerror}", "a readable folder", "name it with --logs DIR")
-    share = free / total if total > 0 else 0.0
-    found = f"{folder}: {free / GIB:.1f} GiB free, {share:.0%}"
-    expected = f"{ARMING_FREE_SHARE:.0%} or more"
-    if share < ARMING_FREE_SHARE:
+    need = arming_free_bytes(total)
+    found = f"{folder}: {free / GIB:.1f} GiB free of {total / GIB:.1f} GiB"
+    expected = f"{need / GIB:.1f} GiB or more"
+    if free < need:
         return Check(name, Level.FAIL, found, expected, "delete old flight logs; a run is refused until then")
     return Check(name, Level.OK, found, expected)
 

@@ -8,13 +8,14 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_REFUSED
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, EXIT_REFUSED
 from edge.deploy.board import Board
 from edge.deploy.install import main
 from edge.deploy.releases import Contents, Home, Layout, Release, ReleaseError, read_home
@@ -196,7 +197,7 @@ def test_half_copied_artifacts_are_refused_and_nothing_of_them_stays(installed: 
     _, artifacts = installed.sources(2)
     os.truncate(artifacts / "graph.onnx", 5_000)
     assert installed.install(2) == EXIT_REFUSED
-    assert "a hash differs" in installed.lines[-1] and "current release is unchanged" in installed.lines[-1]
+    assert "a hash differs" in installed.lines[-1] and "release 1 is current" in installed.lines[-1]
 
 
 def test_a_manifest_that_was_not_copied_is_refused(installed: Versions) -> None:
@@ -304,6 +305,23 @@ def test_remove_leaves_nothing_of_board_and_everything_of_the_user(versions: Ver
 def test_remove_where_nothing_was_installed_is_one_line(versions: Versions) -> None:
     assert versions.call("remove") == EXIT_BAD_INPUT
     assert len(versions.lines) == 1 and not versions.home.exists()
+
+
+class Interrupted(Disk):
+    """Ctrl-C at the first folder that is to be removed."""
+
+    def remove_tree(self, folder: Path) -> None:
+        raise KeyboardInterrupt
+
+
+def test_an_interrupted_call_says_which_release_is_current_now(versions: Versions) -> None:
+    for version in (1, 2):
+        versions.install(version)
+    versions.board = replace(versions.board, disk=Interrupted())
+    assert versions.install(3, "--keep", "1") == EXIT_INTERRUPTED
+    assert current(versions.home) == 3 and versions.lines[-1] == "interrupted; release 3 is current, run it again"
+    assert versions.call("remove") == EXIT_INTERRUPTED
+    assert versions.lines[-1] == "interrupted; no release is current, run it again"
 
 
 # --- properties of the order

@@ -186,7 +186,7 @@ def test_a_full_disk_leaves_the_old_release_and_nothing_of_the_new(
     filled = shutil.disk_usage(small_disk).free - free_kb * 1000
     (small_disk / "filler").write_bytes(bytes(filled))
     assert versions.install(2) == EXIT_CHECK_FAILED
-    assert "the disk is full" in versions.lines[-1] and "current release is unchanged" in versions.lines[-1]
+    assert "the disk is full" in versions.lines[-1] and "release 1 is current" in versions.lines[-1]
     assert versions.numbers() == [1] and current(versions.home) == 1 and starts(versions.home)
     (small_disk / "filler").unlink()
     assert versions.install(2) == EXIT_DONE and starts(versions.home)

@@ -183,9 +183,14 @@ def test_free_memory_is_held_against_the_plan(tmp_path: Path, gib: float, level:
     assert memory(PLAN, tmp_path).level is level
 
 
-@pytest.mark.parametrize(("free", "level"), [(7, Level.OK), (6, Level.FAIL), (0, Level.FAIL)])
-def test_below_seven_percent_of_free_disk_nothing_starts(tmp_path: Path, free: int, level: Level) -> None:
-    assert disk(tmp_path, lambda _folder: (free * GIB, 100 * GIB)).level is level
+@pytest.mark.parametrize(
+    ("free_gib", "total_gib", "level"),
+    [(7, 100, Level.OK), (6, 100, Level.FAIL), (0, 100, Level.FAIL), (0.5, 4, Level.OK), (0.4, 4, Level.FAIL)],
+)
+def test_below_seven_percent_or_half_a_gib_of_free_disk_nothing_starts(
+    tmp_path: Path, free_gib: float, total_gib: int, level: Level
+) -> None:
+    assert disk(tmp_path, lambda _folder: (round(free_gib * GIB), total_gib * GIB)).level is level
 
 
 def test_a_folder_whose_free_space_is_unknown_fails(tmp_path: Path) -> None:

@@ -189,6 +189,13 @@ def test_a_run_that_never_began_leaves_no_log(rig: Rig, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_runner_that_waited_spares_a_log_that_another_began_under_its_name(rig: Rig, tmp_path: Path) -> None:
+    (tmp_path / "flight.mcap").write_bytes(b"another's")
+    with pytest.raises(RefusedError, match="File exists"):
+        rig.run(record=tmp_path / "flight.mcap")
+    assert (tmp_path / "flight.mcap").read_bytes() == b"another's"
+
+
 # The threads
 
 
