@@ -217,8 +217,9 @@ class Bridge:
         for request in outputs.requests:
             self._robot.write(request)
         latch_is_kept = self._latch_file.keep(outputs.latch, outputs.status.stamp_ns)
-        if outputs.latch and self._latch_file.failed:
-            reason = f"{outputs.status.reason}; NOT ON DISK: this stop ends with the bridge"
+        if outputs.latch and latch_is_kept and (self._latch_file.failed or self._latch_file.is_late):
+            since = "" if self._latch_file.failed else " yet"
+            reason = f"{outputs.status.reason}; NOT ON DISK{since}: this stop ends with the bridge"
             outputs = replace(outputs, status=replace(outputs.status, reason=reason))
         if isinstance(self._robot, AbsentRobot):
             outputs = replace(outputs, status=replace(outputs.status, reason=self._robot.reason))

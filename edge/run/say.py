@@ -110,8 +110,14 @@ def stop_robot(path: Path, bridge: Path | None = None) -> int:
 @contextlib.contextmanager
 def _question(path: Path, instruction: str) -> Iterator[socket.socket]:
     """Send to the runner; return the socket that receives its answer. Raises OSError."""
-    with tempfile.TemporaryDirectory(prefix="tic-") as own, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as asking:
-        asking.bind(str(Path(own) / "a"))
+    with contextlib.ExitStack() as stack:
+        asking = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
+        try:
+            asking.bind(str(Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tic-"))) / "a"))
+        except OSError:
+            if instruction != STOP:
+                raise
+            # On a full disk the runner cannot answer, but it stops.
         asking.settimeout(ANSWER_S if instruction != STOP else 0.0)  # a full queue must not delay the operator's stop
         asking.sendto(json.dumps({"instruction": instruction}).encode(), str(path))
         yield asking

@@ -5,10 +5,13 @@ from __future__ import annotations
 import os
 import select
 import struct
+import time
 from typing import Final
 
 import can
 from can.interfaces.serial.serial_can import SerialBus
+
+from firmware_bridge.system.serial_backlog import SerialBacklog
 
 _START: Final = 0xAA
 _END: Final = 0xBB
@@ -16,7 +19,6 @@ _HEAD: Final = struct.Struct("<BIBI")
 _FLAG_EXTENDED: Final = 0x80000000
 _FLAG_REMOTE: Final = 0x40000000
 _FLAG_ERROR: Final = 0x20000000
-_MOST_WAITING: Final = 512  # bytes that the line has not taken yet: about 20 frames, which would all be late
 
 
 class SerialFrames:
@@ -71,6 +73,7 @@ class SerialLine(SerialBus):
         super().__init__(channel, timeout=0.0)
         self._frames = SerialFrames()
         self._rest = b""  # of a frame of which the line has taken the beginning
+        self._backlog = SerialBacklog()
 
     @property
     def line_errors(self) -> int:
@@ -92,8 +95,9 @@ class SerialLine(SerialBus):
         identifier = msg.arbitration_id | (_FLAG_EXTENDED if msg.is_extended_id else 0)
         identifier |= (_FLAG_REMOTE if msg.is_remote_frame else 0) | (_FLAG_ERROR if msg.is_error_frame else 0)
         frame = _HEAD.pack(_START, 0, msg.dlc, identifier) + bytes(msg.data) + bytes((_END,))
+        behind = self._backlog.is_behind(self._ser.out_waiting, time.monotonic_ns())
         self._rest = self._written(self._rest, timeout)
-        if self._rest or self._ser.out_waiting > _MOST_WAITING:
+        if self._rest or behind:
             raise can.CanOperationError("the serial line takes no bytes")
         left = self._written(frame, timeout)
         if len(left) == len(frame):

@@ -38,6 +38,7 @@ _FOUND_MOVING_NS: Final = _NS_PER_S  # a Go2 holds its last Move for one second 
 _STOPPING_NS: Final = 500 * _NS_PER_MS  # our choice: time after a stop from which a moving robot counts as disobeying
 _ASLEEP_NS: Final = 100 * _NS_PER_MS
 _BURST_NS: Final = 1_000 * _NS_PER_MS  # longer than an operator's command repeats its stop
+_ARM_AFTER_NS: Final = 2 * _NS_PER_S  # our choice: longer than `edge-bridge arm` takes from its call to its request
 _PRESSES: Final = (
     "emergency stop by an operator",
     "emergency stop pressed at the local input, or its file cannot be read",
@@ -46,6 +47,7 @@ _PRESSES: Final = (
 )
 _STILL_MOVING: Final = "THE ROBOT STILL MOVES: stop it with its own remote"
 _NO_RUNNER: Final = "operator's arm refused: no runner asks to arm; start edge-run or read its last line, then repeat"
+_JUST_STOPPED: Final = "operator's arm refused: an emergency stop came less than 2 s before it; look, then repeat it"
 _LATCHED: Final = "`edge-bridge arm` ends this while a runner waits"
 
 
@@ -80,7 +82,7 @@ class BridgeCore:
         self._permit = OperatorPermit(safety.operator_arm, latch)
         self._had_client = self._ever_armed = self._released = False
         self._pressed = (False, False, False, False)
-        self._pressed_ns = _NEVER_NS
+        self._pressed_ns = self._last_pressed_ns = _NEVER_NS
         self._press_sent_ns = _NEVER_NS
         self._pressed_here = False  # in this step, by an operator or at the local input
         self._asleep_ns: int | None = None
@@ -158,8 +160,11 @@ class BridgeCore:
                 self._permit.hold(reason)
         new = [now and not before for now, before in zip(pressed, self._pressed, strict=True)]
         if any(new):
-            self._pressed_here = any(new[:2])
+            mission = inputs.estop and inputs.robot.taken_over  # a held input ends it, whoever has begun it
+            self._pressed_here = any(new[:2]) or mission
+            self._press_sent_ns = _NEVER_NS if mission else self._press_sent_ns
             self._engage(now_ns)
+        self._last_pressed_ns = now_ns if any(pressed) else self._last_pressed_ns
         self._pressed = pressed
         if not stop and any(isinstance(message, Arm) for message in inputs.operator):
             self._take_permission(now_ns)
@@ -188,7 +193,10 @@ class BridgeCore:
     def _take_permission(self, now_ns: int) -> None:
         if not self._permit.is_needed or self._state in ("arming", "armed"):
             return
-        if not self._permit.give(now_ns):
+        if not any(self._pressed) and now_ns - self._last_pressed_ns < _ARM_AFTER_NS:
+            # It may have been entered before that stop, by somebody who does not know of it.
+            self._cause, self._reason = "operator", _JUST_STOPPED
+        elif not self._permit.give(now_ns):
             self._cause, self._reason = "operator", _NO_RUNNER
         elif self._watch.danger(now_ns) is None:  # a danger voids it in this same step
             self._cause, self._reason = "none", "permitted by an operator, waiting for the runner to arm"

@@ -291,8 +291,6 @@ class Session:
         mode = self.watch.mode
         return "unknown" if mode is None else modes.MODE_NAMES[mode]
 
-    # Requests of the bridge's rules
-
     def write(self, request: Request, now_ns: int) -> None:
         """Queue the packets of one request."""
         self._now_ns = now_ns
@@ -357,10 +355,12 @@ class Session:
     def farewell(self, now_ns: int) -> None:
         """Queue the last packets: zero, and, for a rover in our own mode, hold; a standing one is disarmed too."""
         self._now_ns = now_ns
-        if self.watch.mode not in (modes.ARMED_DRIVE, modes.ARMED_HOLD) or not self._own_ns or self.watch.yielded:
+        armed = self.watch.mode in (modes.ARMED_DRIVE, modes.ARMED_HOLD) and self._own_ns
+        arms = now_ns - self._own_ns.get(ARM_DISARM, -_OWN_NS) < _OWN_NS  # no heartbeat may show it yet
+        if self.watch.yielded or not (armed or arms):
             return
         self._setpoint(0.0, 0.0, 0.0)
-        hold, standing = (_CUSTOM_MODE, *map(float, self._autopilot.hold)), self.odometry.stands(now_ns)
+        hold, standing = (_CUSTOM_MODE, *map(float, self._autopilot.hold)), not armed or self.odometry.stands(now_ns)
         for tries in range(2):  # nobody will repeat them
             self._send_command(SET_MODE, tries, hold)
             if standing:

@@ -9,16 +9,17 @@ import os
 import socket
 import sys
 import termios
+import time
 import tty
 from typing import Final, Protocol
 
 from firmware_bridge.core.config import MavlinkConfig
 from firmware_bridge.core.robot_state import LinkOpenError
+from firmware_bridge.system.serial_backlog import SerialBacklog
 
 _MAX_DATAGRAM_BYTES: Final = 2048
 _MAX_DATAGRAMS: Final = 64  # a step: 3200 a second at 50 Hz
 _MAX_SERIAL_BYTES: Final = 4096  # a step: 2 Mbaud at 50 Hz
-_MOST_WAITING: Final = 512  # bytes that a serial line has not taken yet: 90 ms at 57600 baud
 _REOPEN_NS: Final = 1_000_000_000
 
 
@@ -89,6 +90,7 @@ class SerialTransport:
         self._path, self._baud = path, baud
         self._rest = b""  # of a packet that the line took in part
         self._retry_ns = 0
+        self._backlog = SerialBacklog()
         self._file: int | None = None
         try:
             self._file = _open_line(path, baud)
@@ -115,7 +117,8 @@ class SerialTransport:
 
     def send(self, data: bytes) -> bool:
         """Send one packet, or nothing of it while the line owes earlier ones: a late command is worse than none."""
-        if not self._write(self._rest) or self._rest or self._waiting_bytes() > _MOST_WAITING:
+        behind = self._backlog.is_behind(self._waiting_bytes(), time.monotonic_ns())
+        if not self._write(self._rest) or self._rest or behind:
             return False
         return self._write(data)
 

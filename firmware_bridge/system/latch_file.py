@@ -74,6 +74,11 @@ class LatchFile:
             self._changes.put((self._change, reason))
         return self._done == self._change or now_ns - self._changed_ns > _PATIENCE_NS
 
+    @property
+    def is_late(self) -> bool:
+        """Whether the disk has not taken the last change yet."""
+        return self._done != self._change
+
     def close(self, timeout_s: float) -> None:
         """Wait up to `timeout_s` for the last change, then end."""
         self._changes.put(None)

@@ -15,6 +15,9 @@ _LOCK_PRESENT_FUTURE_ONCE_TOUCHED: Final = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE,
 _LEAVE: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP, signal.SIGXCPU)
 """Signals that end the bridge with the robot stopped, also a closed terminal, Ctrl-Z and LimitRTTIME's warning."""
 
+_STAY: Final = (signal.SIGTTOU, signal.SIGTTIN)
+"""Signals that would freeze a bridge in the background of a terminal at its next line."""
+
 
 def settle_memory() -> None:
     """Let the garbage collector pass over everything that exists now: later collections visit a step's objects only."""
@@ -42,6 +45,8 @@ def signals_to_socket() -> Iterator[socket.socket]:
         for number in _LEAVE:
             if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:  # nohup asks to stay
                 signal.signal(number, lambda *_: None)
+        for number in _STAY:
+            signal.signal(number, signal.SIG_IGN)
         try:
             yield readable
         finally:

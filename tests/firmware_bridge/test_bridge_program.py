@@ -165,6 +165,18 @@ def test_a_bridge_under_nohup_stays_when_its_terminal_is_closed() -> None:
     assert done.stdout.split() == [str(int(signal.SIGTERM))]
 
 
+def test_a_terminal_that_stops_background_programs_does_not_freeze_the_bridge() -> None:
+    script = (
+        "import os, signal; from firmware_bridge.system.process import signals_to_socket\n"
+        "with signals_to_socket():\n"
+        "    os.kill(os.getpid(), signal.SIGTTOU); os.kill(os.getpid(), signal.SIGTTIN); print('on')\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, cwd=REPOSITORY) as process:
+        _, status = os.waitpid(process.pid, os.WUNTRACED)
+        process.kill()
+        assert process.stdout is not None and process.stdout.read() == "on\n" and not os.WIFSTOPPED(status)
+
+
 def test_a_bridge_without_the_right_to_a_priority_runs_without_one(monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         scheduling = FakeScheduling(patch, os.SCHED_OTHER, 0, permitted=False)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import socket
 import stat
 import threading
@@ -150,3 +152,18 @@ def test_a_silent_socket_is_not_waited_for_long(path: Path) -> None:
         deaf.bind(str(path))
         with pytest.raises(say.SayError, match="no answer within"):
             say.say(path, "go", timeout_s=0.05)
+
+
+def test_a_stop_reaches_the_runner_although_no_temporary_folder_can_be_made(
+    path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(**_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(say.tempfile, "TemporaryDirectory", refuse)
+    monkeypatch.setattr(say, "STOP_ANSWER_S", 0.05)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as deaf:
+        deaf.bind(str(path))
+        assert say.main(["stop", "--to", str(path), "--socket", str(path.parent / "none")]) == 1
+        assert json.loads(deaf.recv(1000)) == {"instruction": "stop"}
+    assert "NOT confirmed" in capsys.readouterr().err

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import socket
 import sys
+import time
 import tty
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -37,6 +40,15 @@ def pty_pair(tmp_path: Path) -> Iterator[tuple[int, Path]]:
         os.close(end)
 
 
+def read(file: int, count: int) -> bytes:
+    """Read so many bytes, in as many pieces as they come."""
+    data, until_s = b"", time.monotonic() + 5
+    while len(data) < count and time.monotonic() < until_s:
+        with contextlib.suppress(BlockingIOError):
+            data += os.read(file, 100)
+    return data
+
+
 class TestSerial:
     def test_bytes_pass_unchanged_in_both_directions(self, pty_pair: tuple[int, Path]) -> None:
         ours, path = pty_pair
@@ -62,15 +74,37 @@ class TestSerial:
         assert received == b"".join(sent)[: len(received)] and len(received) >= 50 * (len(sent) - 1)
         line.close()
 
-    @pytest.mark.parametrize(("waiting", "taken"), [(512, True), (513, False)])
+    @pytest.mark.parametrize(("waiting", "after_ms", "taken"), [(512, 60_000, True), (513, 39, True), (513, 40, False)])
     def test_a_line_that_is_too_slow_refuses_packets_so_that_none_comes_late(
-        self, pty_pair: tuple[int, Path], monkeypatch: pytest.MonkeyPatch, waiting: int, taken: bool
+        self, pty_pair: tuple[int, Path], monkeypatch: pytest.MonkeyPatch, waiting: int, after_ms: int, taken: bool
     ) -> None:
         ours, path = pty_pair
-        line = SerialTransport(str(path), BAUD)
+        line, now_ms = SerialTransport(str(path), BAUD), [0]
+        clock = SimpleNamespace(monotonic_ns=lambda: now_ms[0] * 1_000_000)
+        monkeypatch.setattr("firmware_bridge.mavlink.transport.time", clock)
+        assert line.send(b"first")
         monkeypatch.setattr("fcntl.ioctl", lambda *_: waiting.to_bytes(4, sys.byteorder))
+        now_ms[0] = after_ms
         assert line.send(b"packet") == taken
-        assert (os.read(ours, 100) if taken else b"packet") == b"packet"
+        expected = b"first" + b"packet" * taken
+        assert read(ours, len(expected)) == expected
+        line.close()
+
+    def test_a_usb_line_takes_every_packet_of_a_burst(
+        self, pty_pair: tuple[int, Path], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        ours, path = pty_pair
+        line, now_ms = SerialTransport(str(path), BAUD), [0]
+        clock = SimpleNamespace(monotonic_ns=lambda: now_ms[0] * 1_000_000)
+        monkeypatch.setattr("firmware_bridge.mavlink.transport.time", clock)
+        under_way = [0]
+        monkeypatch.setattr("fcntl.ioctl", lambda *_: (1280 * under_way[0]).to_bytes(4, sys.byteorder))
+        for _ in range(100):  # steps of the bridge: zero velocity, hold, disarm
+            for packet in (b"zero", b"hold", b"disarm"):
+                assert line.send(packet)
+                under_way[0] += 1
+            assert read(ours, 14) == b"zeroholddisarm"
+            now_ms[0], under_way[0] = now_ms[0] + 20, 0
         line.close()
 
     def test_a_line_that_vanishes_is_opened_again_after_a_second(

@@ -107,7 +107,7 @@ class Heartbeats:
         return [message.param2 for message in self.bench.commands(SET_MODE, since_ns)]
 
 
-HOLD = 4.0
+HOLD = 4
 
 
 @pytest.mark.parametrize(("mode", "status"), [(AUTO, ACTIVE), (RTL, CRITICAL)], ids=["mission", "failsafe"])
@@ -116,6 +116,18 @@ def test_an_operators_stop_ends_a_mode_in_which_the_autopilot_drives(mode: int, 
     rover.beat(GUIDED)
     rover.beat(mode, status)
     assert set(rover.press(mode, status)) == {HOLD}
+
+
+def test_a_mission_that_begins_while_the_local_input_is_held_is_ended() -> None:
+    rover = Heartbeats()
+    rover.beat(GUIDED)
+    rover.bench.speed, rover.bench.estop = None, True
+    rover.beat(HOLD)
+    rover.beat(HOLD, seconds=0.1)
+    since_ns = rover.bench.now_ns
+    rover.beat(AUTO)
+    rover.beat(AUTO)
+    assert {message.param2 for message in rover.bench.commands(SET_MODE, since_ns)} == {HOLD}
 
 
 def test_an_operators_stop_leaves_a_pilot_the_sticks() -> None:
@@ -153,3 +165,18 @@ def test_the_last_packets_hold_a_rover_that_was_ready_when_it_was_armed() -> Non
     bench.session.outgoing()
     bench.session.farewell(bench.now_ns)
     assert bench.session.outgoing()
+
+
+@pytest.mark.parametrize("autopilot", list(AUTOPILOTS))
+@pytest.mark.parametrize("after_s", [0.0, 0.3])
+def test_the_last_packets_disarm_a_rover_that_was_armed_since_its_last_heartbeat(
+    autopilot: str, after_s: float
+) -> None:
+    bench = RoverBench(AUTOPILOTS[autopilot])
+    bench.speed, bench.to_bridge = (0.5, 0.0), once_a_second(bench)
+    bench.until(lambda: bool(bench.commands(ARM_DISARM)), 25.0, "an arm command")
+    if after_s:
+        bench.run(after_s)
+    bench.session.farewell(bench.now_ns)
+    bench.flush()
+    assert bench.mode is Mode.HOLD and not bench.node.vehicle.armed

@@ -88,6 +88,7 @@ class RoverBench:
         self.status: BridgeStatus | None = None
         self.speed: tuple[float, float] | None = None
         self.asking = self.client = True
+        self.estop = False  # the local input
         self.operator: list[object] = []  # messages of the next step
         self._seq = 0
 
@@ -140,7 +141,7 @@ class RoverBench:
             armed = self.status is not None and self.status.state == "armed"
             messages.append(Velocity(self._seq, self.now_ns, self.speed[0] * armed, 0.0, self.speed[1] * armed))
         operator, self.operator = self.operator, []
-        outputs = self.core.step(Inputs(messages, self.client, report, operator), self.now_ns)
+        outputs = self.core.step(Inputs(messages, self.client, report, operator, self.estop), self.now_ns)
         for request in outputs.requests:
             self.session.write(request, self.now_ns)
         self.flush()
