@@ -38,6 +38,7 @@ _FOUND_MOVING_NS: Final = _NS_PER_S  # a Go2 holds its last Move for one second 
 _STOPPING_NS: Final = 500 * _NS_PER_MS  # our choice: time after a stop from which a moving robot counts as disobeying
 _ASLEEP_NS: Final = 100 * _NS_PER_MS
 _BURST_NS: Final = 1_000 * _NS_PER_MS  # longer than an operator's command repeats its stop
+_TOLD_NS: Final = 1_500 * _NS_PER_MS  # longer than `edge-bridge arm` waits for its confirmation
 _ARM_AFTER_NS: Final = 2 * _NS_PER_S  # our choice: longer than `edge-bridge arm` takes from its call to its request
 _PRESSES: Final = (
     "emergency stop by an operator",
@@ -82,7 +83,7 @@ class BridgeCore:
         self._permit = OperatorPermit(safety.operator_arm, latch)
         self._had_client = self._ever_armed = self._released = False
         self._pressed = (False, False, False, False)
-        self._pressed_ns = self._last_pressed_ns = _NEVER_NS
+        self._pressed_ns = self._last_pressed_ns = self._told_ns = _NEVER_NS
         self._press_sent_ns = _NEVER_NS
         self._pressed_here = False  # in this step, by an operator or at the local input
         self._asleep_ns: int | None = None
@@ -195,7 +196,7 @@ class BridgeCore:
             return
         if not any(self._pressed) and now_ns - self._last_pressed_ns < _ARM_AFTER_NS:
             # It may have been entered before that stop, by somebody who does not know of it.
-            self._cause, self._reason = "operator", _JUST_STOPPED
+            self._cause, self._reason, self._told_ns = "operator", _JUST_STOPPED, now_ns
         elif not self._permit.give(now_ns):
             self._cause, self._reason = "operator", _NO_RUNNER
         elif self._watch.danger(now_ns) is None:  # a danger voids it in this same step
@@ -226,6 +227,8 @@ class BridgeCore:
             return
         self._permit.ask(now_ns)
         if not self._permit.allows(now_ns):
+            if now_ns - self._told_ns < _TOLD_NS:
+                return  # an operator is still to read why the arm was refused
             # Before everything else and without a change of state: a runner may repeat the request for hours.
             latch = f" ({self._permit.latch})" if self._permit.latch else ""
             self._cause, self._reason = "operator", f"arm refused: waiting for an operator's `edge-bridge arm`{latch}"

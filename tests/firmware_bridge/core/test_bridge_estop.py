@@ -175,6 +175,18 @@ class TestPermission:
         assert bench.status.permit == permit
         assert ("less than 2 s before" in bench.status.reason) == (permit == "needed")
 
+    def test_the_operator_reads_why_although_the_runner_asks_on(self) -> None:
+        bench = Bench().arm()
+        _operator(bench)
+        bench.step(operator=(Arm(),))
+        for _ in range(10):
+            bench.wait(100)
+            bench.step(Arm())
+        assert "less than 2 s before" in bench.status.reason
+        bench.wait(1_000)
+        bench.step(Arm())
+        assert bench.status.reason.startswith("arm refused: waiting for an operator")
+
     def test_it_is_refused_without_a_runner_that_requests_arming(self) -> None:
         bench = self.held()
         bench.step(operator=(Arm(),))

@@ -333,7 +333,7 @@ def test_an_operator_stops_a_driven_robot_and_only_an_operator_takes_it_back(
     with driver(socket_path, tmp_path):
         wait_for(lambda: "arm refused" in bridge.stderr(), 10, "the refusal")
         assert not robot.is_driven()
-        assert status("arm")["permit"] == "given"
+        wait_for(lambda: operate("arm", socket_path)[0] == 0, 5, "the permission")
         wait_for(robot.is_driven, 20, "the robot is driven again")
 
 

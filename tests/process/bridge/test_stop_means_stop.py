@@ -180,6 +180,7 @@ class TestPermission:
     ) -> None:
         rig.reset()
         assert rig.operate("stop")[0] == 0
+        time.sleep(2.0)
 
         def once(number: int) -> dict[str, float]:
             time.sleep(0.05)

@@ -95,7 +95,7 @@ def test_a_driven_robot_stops_and_no_runner_arms_before_an_operator_does(robot: 
         wait_for(lambda: "arm refused" in side.bridge.stderr(), 10, "the refusal")
         time.sleep(0.5)
         assert not robot.is_driven()
-        assert operate("arm", side.socket)[0] == 0
+        wait_for(lambda: operate("arm", side.socket)[0] == 0, 5, "the permission")
         wait_for(robot.is_driven, 20, "the robot is driven again")
 
 

@@ -254,7 +254,7 @@ class Rig:
     def _operator_arms(self) -> None:
         """Permit the waiting runner to arm, as an operator does, and again for a while. Raises StepError.
 
-        The bridge refuses for a second after the end of a pressed stop or of a person's driving.
+        The bridge refuses for two seconds after a stop and for one after a person's driving.
         """
         socket = str(self.folder / BRIDGE_SOCKET)
         command = [*COMMANDS["edge-bridge"], "arm", *self._link(), "--socket", socket]
