@@ -2,12 +2,14 @@
 start.
 
 A recording bounds itself, but every start makes another. Whole runs are deleted, the oldest first, until the rest fits;
-the newest runs stay whatever they take, so that the last events can always be read.
+the newest runs stay whatever they take, so that the last events can always be read. Which run is newer, `flight-order`
+says, where each call adds the runs that it has not seen: a board without a clock begins every day at the same date.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import re
 import shutil
 import stat
@@ -17,7 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, command_line, messages
+from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE, command_line, messages, write_whole
+from firmware_bridge.system.input_file import read_text
 from firmware_bridge.system.terminal import CommandParser
 
 KEEP_BYTES: Final = 8 * 1024**3
@@ -25,6 +28,7 @@ KEEP_BYTES: Final = 8 * 1024**3
 KEEP_SHARE: Final = 0.25
 """Largest share of the file system, where that is less."""
 KEEP_RUNS: Final = 2
+ORDER: Final = "flight-order"
 _PART: Final = re.compile(r"(flight-[A-Za-z0-9_-]+)(?:\.\d{3,})?\.mcap", re.ASCII)
 
 EXAMPLES = """examples:
@@ -40,37 +44,48 @@ exit codes: 0 done, 2 bad arguments or a folder that cannot be read or written, 
 class _Run:
     """Files of one recording."""
 
+    name: str
     newest_ns: int = 0
     size: int = 0
     files: tuple[Path, ...] = ()
 
 
 def runs(folder: Path) -> list[_Run]:
-    """Return the recordings in a folder, newest first; raises OSError."""
+    """Return the recordings in a folder, newest first: those seen earlier in that order, then the new by time of file.
+
+    Raises OSError.
+    """
     found: dict[str, _Run] = {}
     for path in sorted(folder.iterdir()):
         match, status = _PART.fullmatch(path.name), path.lstat()
         if match is None or not stat.S_ISREG(status.st_mode):
             continue
-        run = found.setdefault(match[1], _Run())
+        run = found.setdefault(match[1], _Run(match[1]))
         run.newest_ns = max(run.newest_ns, status.st_mtime_ns)
         run.size += status.st_size
         run.files += (path,)
-    return sorted(found.values(), key=lambda run: -run.newest_ns)
+    seen: dict[str, int] = {}
+    with contextlib.suppress(OSError, ValueError):  # none yet, or damaged: the times of the files decide
+        seen = {name: number for number, name in enumerate(read_text(folder / ORDER).split())}
+    return sorted(found.values(), key=lambda run: (seen.get(run.name, len(seen)), run.newest_ns), reverse=True)
 
 
 def clean(folder: Path, keep_bytes: int, keep_runs: int = KEEP_RUNS) -> tuple[list[Path], int]:
     """Delete old recordings beyond the total; return the deleted files and the remaining bytes. Raises OSError."""
     deleted: list[Path] = []
+    kept: list[str] = []
     left = 0
     for number, run in enumerate(runs(folder)):
         # After the first recording that does not fit, delete all older ones.
         if number < keep_runs or (not deleted and left + run.size <= keep_bytes):
             left += run.size
+            kept.insert(0, run.name)
             continue
         for path in run.files:
             path.unlink(missing_ok=True)
             deleted.append(path)
+    with contextlib.suppress(OSError):  # a full disk: the next call does it
+        write_whole(folder / ORDER, "\n".join(kept) + "\n")
     return deleted, left
 
 

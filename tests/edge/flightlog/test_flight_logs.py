@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE
-from edge.flightlog.cleanup import KEEP_RUNS, clean, main
+from edge.flightlog.cleanup import KEEP_RUNS, ORDER, clean, main
 
 HUGE = 1 << 60
 
@@ -21,7 +21,7 @@ def log(folder: Path, name: str, size: int, at_s: int) -> Path:
 
 
 def names(folder: Path) -> set[str]:
-    return {path.name for path in folder.iterdir()}
+    return {path.name for path in folder.iterdir()} - {ORDER}
 
 
 @pytest.fixture
@@ -46,6 +46,27 @@ def test_a_run_is_as_old_as_its_newest_part(folder: Path) -> None:
     clean(folder, 0)
     assert {"flight-0.mcap", "flight-4.mcap"} <= names(folder)
     assert "flight-3.mcap" not in names(folder)
+
+
+def test_a_board_without_a_clock_keeps_its_newest_runs(tmp_path: Path) -> None:
+    for name, minutes in (("monday", 180), ("tuesday", 170), ("wednesday", 5)):  # every boot begins at the same date
+        log(tmp_path, f"flight-{name}.mcap", 100, 60 * minutes)
+        clean(tmp_path, HUGE)
+    clean(tmp_path, 0)
+    assert names(tmp_path) == {"flight-tuesday.mcap", "flight-wednesday.mcap"}
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff\xfe", b"flight-9 flight-3\n\0"], ids=["empty", "no text", "foreign"])
+def test_a_damaged_order_is_replaced_by_the_times_of_the_files(folder: Path, content: bytes) -> None:
+    (folder / ORDER).write_bytes(content)
+    clean(folder, 350)
+    assert "flight-4.mcap" in names(folder) and (folder / ORDER).read_text().split()[-1] == "flight-4"
+
+
+def test_an_order_that_cannot_be_written_keeps_nothing_from_being_deleted(folder: Path) -> None:
+    (folder / ORDER).mkdir()
+    _, left = clean(folder, 0)
+    assert left == 100 * KEEP_RUNS
 
 
 def test_the_newest_runs_stay_at_any_size(folder: Path) -> None:
