@@ -59,8 +59,8 @@ EPILOG: Final = """examples:
                                          after a restart of the bridge; done when the robot itself reports that it
                                          stands still
   edge-bridge arm --robot go2.toml       permit the runner that waits now to arm once, within 10 s: after an emergency
-                                         stop (operator, remote, GPIO file), and before every arming where the robot
-                                         file says operator_arm
+                                         stop (operator, remote, GPIO file), from 2 s after it on, and before every
+                                         arming where the robot file says operator_arm
   edge-bridge release --robot go2.toml   after a stop: send no command, so that a person can use the remote
   edge-bridge status --robot go2.toml    what the running bridge is doing
 stop, arm, release and status look for a bridge at the installed service's socket (run them with sudo then, or as a
@@ -69,8 +69,8 @@ looks at the usual places.
 exit codes: 0 ended by a signal or the terminal's end, robot stopped (stop, arm, release, status: done); 1 internal
 failure or removed sockets, robot stopped (stop: the robot has not reported that it stands still, or another bridge
 has died or cannot be reached; use the remote); 2 bad arguments or robot file; 3 refused: another bridge owns the
-socket (stop, arm, release, status: no bridge is running, or none that this user may reach; arm: no runner waits, or
-more than one bridge); 130 interrupted (stop, arm, release, status)"""
+socket (stop, arm, release, status: no bridge is running, or none that this user may reach; arm: no runner waits, a
+stop came less than 2 s before, or more than one bridge); 130 interrupted (stop, arm, release, status)"""
 
 
 class Bridge:
