@@ -48,7 +48,7 @@ _PRESSES: Final = (
 )
 _STILL_MOVING: Final = "THE ROBOT STILL MOVES: stop it with its own remote"
 _NO_RUNNER: Final = "operator's arm refused: no runner asks to arm; start edge-run or read its last line, then repeat"
-_JUST_STOPPED: Final = "operator's arm refused: an emergency stop came less than 2 s before it; look, then repeat it"
+_JUST_STOPPED: Final = "operator's arm refused: a stop came or ended less than 2 s before it; look, then repeat it"
 _LATCHED: Final = "`edge-bridge arm` ends this while a runner waits"
 
 
@@ -85,7 +85,9 @@ class BridgeCore:
         self._pressed = (False, False, False, False)
         self._pressed_ns = self._last_pressed_ns = self._told_ns = _NEVER_NS
         self._press_sent_ns = _NEVER_NS
-        self._pressed_here = False  # in this step, by an operator or at the local input
+        self._pressed_here = (
+            False  # in this step, by an operator or at the local input, or held while the robot drives itself
+        )
         self._asleep_ns: int | None = None
         self._stop_sent_ns = self._stopped_ns = self._asked_ns = _NEVER_NS
         self._called: dict[int | None, int] = {}  # step -> when, during this arming
@@ -161,14 +163,16 @@ class BridgeCore:
                 self._permit.hold(reason)
         new = [now and not before for now, before in zip(pressed, self._pressed, strict=True)]
         if any(new):
-            mission = inputs.estop and inputs.robot.taken_over  # a held input ends it, whoever has begun it
-            self._pressed_here = any(new[:2]) or mission
-            self._press_sent_ns = _NEVER_NS if mission else self._press_sent_ns
+            self._pressed_here = any(new[:2])
+            self._told_ns = _NEVER_NS
             self._engage(now_ns)
+        if inputs.estop and inputs.robot.drives_itself and self._state != "armed":
+            self._pressed_here = True
+            self._send_press(now_ns)  # again until it holds, whatever gets lost
         self._last_pressed_ns = now_ns if any(pressed) else self._last_pressed_ns
         self._pressed = pressed
         if not stop and any(isinstance(message, Arm) for message in inputs.operator):
-            self._take_permission(now_ns)
+            self._take_permission(now_ns, held=inputs.estop)
         elif not stop and any(isinstance(message, Release) for message in inputs.operator):
             self._release()
         accepted = (Arm, Stop, Release)  # only the runner's socket commands
@@ -185,21 +189,26 @@ class BridgeCore:
         if idle and robot is not None and is_driven(robot, self._table):
             self._state, self._ever_armed = "armed", True
             self._stop("estop", self._permit.latch, now_ns)
-        elif self._pressed_here and self._state != "armed" and now_ns - self._press_sent_ns > _BURST_NS:
+        elif self._pressed_here and self._state != "armed":
             # Whatever the robot reports: it may have been commanded to move before, or drive by itself.
+            self._send_press(now_ns)
+
+    def _send_press(self, now_ns: int) -> None:
+        if now_ns - self._press_sent_ns > _BURST_NS:
             self._press_sent_ns = now_ns
             self._move(_ZERO)
             self._send_stop(now_ns)
 
-    def _take_permission(self, now_ns: int) -> None:
+    def _take_permission(self, now_ns: int, *, held: bool) -> None:
         if not self._permit.is_needed or self._state in ("arming", "armed"):
             return
-        if not any(self._pressed) and now_ns - self._last_pressed_ns < _ARM_AFTER_NS:
+        if not held and now_ns - self._last_pressed_ns < _ARM_AFTER_NS:
             # It may have been entered before that stop, by somebody who does not know of it.
             self._cause, self._reason, self._told_ns = "operator", _JUST_STOPPED, now_ns
         elif not self._permit.give(now_ns):
             self._cause, self._reason = "operator", _NO_RUNNER
         elif self._watch.danger(now_ns) is None:  # a danger voids it in this same step
+            self._told_ns = _NEVER_NS
             self._cause, self._reason = "none", "permitted by an operator, waiting for the runner to arm"
 
     def _release(self) -> None:

@@ -16,7 +16,8 @@ class Report:
 
     `remote_in_use`: a person drives the robot by its remote, or has switched it to a mode of the remote.
     `remote_estop`: the robot's own emergency stop was pressed. `taken_over`: a person has changed the mode of the robot
-    while the bridge drove it, or has chosen an automatic mode; it latches like an emergency stop. `foreign` names a
+    while the bridge drove it, or has chosen an automatic mode; it latches like an emergency stop. `drives_itself`: the
+    robot is in an automatic mode, such as a mission or a return, and may move by it. `foreign` names a
     motion or mode request of another client. `denied` names a request of ours that the robot denied because another
     client holds its lease. `publishers` names the input that has more than one publisher. `version` is the robot's
     answer to `Identify`. `writes_fail`: the network has refused our last commands. `unsafe` names a property of the
@@ -34,6 +35,7 @@ class Report:
     writes_fail: bool = False
     unsafe: str | None = None
     taken_over: bool = False
+    drives_itself: bool = False
 
 
 @dataclass(frozen=True)
@@ -66,8 +68,8 @@ class Move:
 class StopMotion:
     """Request that the robot stops by its own means, without waiting for its answer.
 
-    `pressed`: a person at this computer has pressed the emergency stop. It ends an automatic mode of the robot, too,
-    such as a mission; a person who steers the robot keeps it.
+    `pressed`: a person at this computer has pressed the emergency stop, or holds the local input while the robot drives
+    itself. It ends an automatic mode of the robot, too, such as a mission; a person who steers the robot keeps it.
     """
 
     pressed: bool = False

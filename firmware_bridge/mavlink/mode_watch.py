@@ -2,7 +2,7 @@
 
 A change that the bridge did not request comes from a person (the remote's switch, a ground station) or from a failsafe.
 It always wins: the bridge sends no mode command until the next arming, or until a person presses its emergency stop
-while nobody steers the rover.
+while nobody steers the rover, or holds the local input while the rover drives itself.
 """
 
 from __future__ import annotations

@@ -103,8 +103,6 @@ class Session:
         self._denials: list[tuple[int, str, str]] = []  # when, command, result
         self._told: set[str] = set()
 
-    # Received messages
-
     def take(self, data: bytes, now_ns: int) -> None:
         """Read received bytes; what cannot be true is counted."""
         self._now_ns = now_ns
@@ -190,8 +188,6 @@ class Session:
         if line is not None:
             self._tell(line)
 
-    # Once a step
-
     def report(self, now_ns: int) -> Report:
         """Return the report of everything taken since the last call, and queue the packets that are due."""
         self._now_ns = now_ns
@@ -212,6 +208,7 @@ class Session:
             remote_in_use=switched or self.watch.in_use(),
             remote_estop=self.watch.is_emergency(),
             taken_over=taken_over,
+            drives_itself=self.watch.mode == modes.ARMED_OTHER,
             foreign=foreign,
             denied=denied,
             publishers=f"another sender uses our number {self._config.station}/{COMPONENT}" if clash else None,
@@ -353,14 +350,15 @@ class Session:
             self._send_command(number, tries, params)
 
     def farewell(self, now_ns: int) -> None:
-        """Queue the last packets: zero, and, for a rover in our own mode, hold; a standing one is disarmed too."""
+        """Queue the last packets of a rover of ours, or just arming: zero, hold, and disarm if it stands."""
         self._now_ns = now_ns
-        armed = self.watch.mode in (modes.ARMED_DRIVE, modes.ARMED_HOLD) and self._own_ns
-        arms = now_ns - self._own_ns.get(ARM_DISARM, -_OWN_NS) < _OWN_NS  # no heartbeat may show it yet
-        if self.watch.yielded or not (armed or arms):
+        ours, standing = self.watch.mode in (modes.ARMED_DRIVE, modes.ARMED_HOLD), self.odometry.stands(now_ns)
+        # No heartbeat may show an arming yet; one that moves before then is driven by somebody else.
+        arms = standing and now_ns - self._own_ns.get(ARM_DISARM, -_OWN_NS) < _OWN_NS
+        if self.watch.yielded or not (arms or (ours and self._own_ns)):
             return
         self._setpoint(0.0, 0.0, 0.0)
-        hold, standing = (_CUSTOM_MODE, *map(float, self._autopilot.hold)), not armed or self.odometry.stands(now_ns)
+        hold = (_CUSTOM_MODE, *map(float, self._autopilot.hold))
         for tries in range(2):  # nobody will repeat them
             self._send_command(SET_MODE, tries, hold)
             if standing:

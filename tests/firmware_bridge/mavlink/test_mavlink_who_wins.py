@@ -118,16 +118,30 @@ def test_an_operators_stop_ends_a_mode_in_which_the_autopilot_drives(mode: int, 
     assert set(rover.press(mode, status)) == {HOLD}
 
 
-def test_a_mission_that_begins_while_the_local_input_is_held_is_ended() -> None:
+@pytest.mark.parametrize(("mode", "status"), [(AUTO, ACTIVE), (RTL, CRITICAL)], ids=["mission", "failsafe"])
+def test_a_mode_in_which_the_autopilot_drives_is_ended_as_long_as_the_local_input_is_held(
+    mode: int, status: int
+) -> None:
     rover = Heartbeats()
     rover.beat(GUIDED)
     rover.bench.speed, rover.bench.estop = None, True
     rover.beat(HOLD)
     rover.beat(HOLD, seconds=0.1)
+    for _ in range(6):
+        since_ns = rover.bench.now_ns
+        rover.beat(mode, status, seconds=1.1)
+        assert {message.param2 for message in rover.bench.commands(SET_MODE, since_ns)} == {HOLD}
+
+
+def test_a_pilot_keeps_the_sticks_while_the_local_input_is_held() -> None:
+    rover = Heartbeats()
+    rover.beat(GUIDED)
+    rover.bench.speed, rover.bench.estop = None, True
+    rover.beat(HOLD)
     since_ns = rover.bench.now_ns
-    rover.beat(AUTO)
-    rover.beat(AUTO)
-    assert {message.param2 for message in rover.bench.commands(SET_MODE, since_ns)} == {HOLD}
+    for _ in range(3):
+        rover.beat(MANUAL)
+    assert rover.bench.commands(SET_MODE, since_ns) == []
 
 
 def test_an_operators_stop_leaves_a_pilot_the_sticks() -> None:
@@ -180,3 +194,18 @@ def test_the_last_packets_disarm_a_rover_that_was_armed_since_its_last_heartbeat
     bench.session.farewell(bench.now_ns)
     bench.flush()
     assert bench.mode is Mode.HOLD and not bench.node.vehicle.armed
+
+
+@pytest.mark.parametrize("autopilot", list(AUTOPILOTS))
+def test_the_last_packets_leave_a_pilot_a_rover_that_was_armed_since_its_last_heartbeat(autopilot: str) -> None:
+    bench = RoverBench(AUTOPILOTS[autopilot])
+    bench.speed, bench.to_bridge = (0.5, 0.0), once_a_second(bench)
+    bench.until(lambda: bool(bench.commands(ARM_DISARM)), 25.0, "an arm command")
+    bench.speed, bench.client = None, False
+    bench.run(0.1)
+    bench.base.command(0.8, 0.0, 0.0)
+    bench.run(0.2)
+    since_ns = bench.now_ns
+    bench.session.farewell(bench.now_ns)
+    bench.flush()
+    assert bench.commands(ARM_DISARM, since_ns) == []
