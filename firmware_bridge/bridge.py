@@ -218,8 +218,8 @@ class Bridge:
             self._robot.write(request)
         latch_is_kept = self._latch_file.keep(outputs.latch, outputs.status.stamp_ns)
         if outputs.latch and latch_is_kept and (self._latch_file.failed or self._latch_file.is_late):
-            since = "" if self._latch_file.failed else " yet"
-            reason = f"{outputs.status.reason}; NOT ON DISK{since}: this stop ends with the bridge"
+            lost = "this stop ends with the bridge" if self._latch_file.failed else "a killed bridge loses this stop"
+            reason = f"{outputs.status.reason}; NOT ON DISK: {lost}"
             outputs = replace(outputs, status=replace(outputs.status, reason=reason))
         if isinstance(self._robot, AbsentRobot):
             outputs = replace(outputs, status=replace(outputs.status, reason=self._robot.reason))

@@ -28,6 +28,8 @@ KEEP_BYTES: Final = 8 * 1024**3
 KEEP_SHARE: Final = 0.25
 """Largest share of the file system, where that is less."""
 KEEP_RUNS: Final = 2
+EMPTY_BYTES: Final = 1000
+"""Size below which a run has no records: its runner was killed while it waited to be armed."""
 ORDER: Final = "flight-order"
 _PART: Final = re.compile(r"(flight-[A-Za-z0-9_-]+)(?:\.\d{3,})?\.mcap", re.ASCII)
 
@@ -74,11 +76,12 @@ def clean(folder: Path, keep_bytes: int, keep_runs: int = KEEP_RUNS) -> tuple[li
     """Delete old recordings beyond the total; return the deleted files and the remaining bytes. Raises OSError."""
     deleted: list[Path] = []
     kept: list[str] = []
-    left = 0
-    for number, run in enumerate(runs(folder)):
+    left = newest = 0
+    for run in runs(folder):
         # After the first recording that does not fit, delete all older ones.
-        if number < keep_runs or (not deleted and left + run.size <= keep_bytes):
+        if newest < keep_runs or (not deleted and left + run.size <= keep_bytes):
             left += run.size
+            newest += run.size >= EMPTY_BYTES
             kept.insert(0, run.name)
             continue
         for path in run.files:

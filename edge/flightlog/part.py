@@ -38,6 +38,8 @@ class PartFile:
     def __init__(self, path: Path, *, new: bool) -> None:
         how = os.O_EXCL if new else os.O_TRUNC
         self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | how, 0o644)
+        status = os.fstat(self._descriptor)
+        self.identity = (status.st_dev, status.st_ino)
         self.length = 0
 
     def write(self, data: bytes) -> int:

@@ -119,18 +119,19 @@ class Recorder:
         self._discarded = 0
         self._number = 1
         self._part: LogPart | None = None
-        self._made = False
+        self._made: tuple[int, int] | None = None
         file: PartFile | None = None
         try:
             if len(parts(self.path)) > 1:
                 raise FileExistsError(errno.EEXIST, f"{parts(self.path)[-1].name} of another recording lies beside it")
             # A device or a pipe is there before; a file is never overwritten.
             new = not self.path.exists() or self.path.is_file()
-            file = PartFile(self.path, new=new)
-            self._made = new
+            file = PartFile(Path(os.path.realpath(self.path)), new=new)
+            self._made = file.identity if new else None
         except OSError as error:
             self._ended = True
-            self._error = f"cannot open {self.path} for recording: {error.strerror or error}"
+            advice = "; name another file" if isinstance(error, FileExistsError) else ""
+            self._error = f"cannot open {self.path} for recording: {error.strerror or error}{advice}"
         # A daemon thread: a disk that hangs must not keep the process alive.
         self._thread = threading.Thread(target=self._run, args=(file,), name="recorder", daemon=True)
         if file is not None:
@@ -198,8 +199,10 @@ class Recorder:
 
     def discard(self) -> None:
         """Delete the file of a run that did not begin, after `close`; another's file stays."""
-        if self._made:
-            self.path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # removed meanwhile
+            status = self.path.stat()
+            if (status.st_dev, status.st_ino) == self._made:
+                Path(os.path.realpath(self.path)).unlink()
 
     def _take(self) -> _Item | None:
         with self._lock:
@@ -262,7 +265,7 @@ class Recorder:
             closing = self._closing.is_set()
             while (item := self._take()) is not None:
                 self._write(part, item)
-                if part.file.length >= self._limits.part_bytes:
+                if part.file.length >= self._limits.part_bytes and self._paused is None:
                     part, begun_ns = self._next_part(part), time.monotonic_ns()
                 if time.monotonic_ns() - flushed_ns >= _FLUSH_PERIOD_NS:
                     break

@@ -25,9 +25,31 @@ from firmware_bridge.client_link import ClientLink, SocketTakenError
 from firmware_bridge.core.config import BRIDGE_PRIORITY, SERVICE_SOCKET, load_robot_config, runtime_dir
 from firmware_bridge.core.link import BridgeStatus
 from firmware_bridge.core.robot_state import LinkOpenError
+from firmware_bridge.core.step_types import Outputs, Report
 from firmware_bridge.system.line_log import LineLog
 from firmware_bridge.system.notify import Notifier
 from tests.support.processes import GO2_SIM, REPOSITORY
+
+
+@pytest.mark.parametrize(
+    ("failed", "late", "said"),
+    [(False, False, None), (True, False, "ends with the bridge"), (False, True, "a killed bridge loses this stop")],
+)
+def test_a_confirmed_stop_that_is_not_on_the_disk_says_so(failed: bool, late: bool, said: str | None) -> None:
+    shell, sent = Bridge.__new__(Bridge), []
+    status = BridgeStatus(1, "stopped", "emergency stop by an operator", 0, 0, 0, (0.0, 0.0, 0.0), True)
+    silent = SimpleNamespace(
+        receive=list, connected=False, send_status=lambda _: None, malformed=0, send=lambda _: None
+    )
+    shell._join_late = lambda: None  # type: ignore
+    shell._link, shell._observers, shell._estop_file = silent, silent, None  # type: ignore
+    shell._operators = SimpleNamespace(receive=list, send_status=sent.append)  # type: ignore
+    shell._robot = SimpleNamespace(read=lambda _: Report(), write=lambda _: None)  # type: ignore
+    shell._core = SimpleNamespace(step=lambda *_: Outputs((), status, 0, "latched"))  # type: ignore
+    shell._latch_file = SimpleNamespace(keep=lambda *_: True, failed=failed, is_late=late)  # type: ignore
+    shell._report_progress = lambda _: None  # type: ignore
+    shell._step()
+    assert ("NOT ON DISK" in sent[0].reason) == (said is not None) and (said or "") in sent[0].reason
 
 
 def test_a_frozen_bridge_does_not_feed_the_watchdog() -> None:

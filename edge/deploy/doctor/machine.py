@@ -16,6 +16,7 @@ from edge.deploy import boot
 from edge.deploy.doctor.check import Check, Level, skipped
 from edge.flightlog.recorder import arming_free_bytes
 
+MIB: Final = 1 << 20
 SPARE_MEMORY: Final = 1.2
 """Multiple of the plan's memory below which the free memory gives a warning."""
 BUSY_CORES: Final = 0.5
@@ -248,8 +249,8 @@ def disk(folder: Path, usage: Callable[[Path], tuple[int, int]]) -> Check:
     except OSError as error:
         return Check(name, Level.FAIL, f"{folder}: {error.strerror}", "a readable folder", "name it with --logs DIR")
     need = arming_free_bytes(total)
-    found = f"{folder}: {free / GIB:.1f} GiB free of {total / GIB:.1f} GiB"
-    expected = f"{need / GIB:.1f} GiB or more"
+    found = f"{folder}: {free / MIB:.0f} MiB free of {total / MIB:.0f}"
+    expected = f"{need / MIB:.0f} MiB or more"
     if free < need:
         return Check(name, Level.FAIL, found, expected, "delete old flight logs; a run is refused until then")
     return Check(name, Level.OK, found, expected)

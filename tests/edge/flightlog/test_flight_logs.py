@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from edge.core.cli import EXIT_BAD_INPUT, EXIT_DONE
+from edge.flightlog import cleanup
 from edge.flightlog.cleanup import KEEP_RUNS, ORDER, clean, main
 
 HUGE = 1 << 60
@@ -18,6 +19,11 @@ def log(folder: Path, name: str, size: int, at_s: int) -> Path:
     path.write_bytes(b"x" * size)
     os.utime(path, (at_s, at_s))
     return path
+
+
+@pytest.fixture(autouse=True)
+def small_logs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cleanup, "EMPTY_BYTES", 10)
 
 
 def names(folder: Path) -> set[str]:
@@ -46,6 +52,14 @@ def test_a_run_is_as_old_as_its_newest_part(folder: Path) -> None:
     clean(folder, 0)
     assert {"flight-0.mcap", "flight-4.mcap"} <= names(folder)
     assert "flight-3.mcap" not in names(folder)
+
+
+def test_runs_without_records_do_not_take_the_places_of_the_newest(folder: Path) -> None:
+    for number in (7, 8, 9):  # killed while they waited to be armed
+        log(folder, f"flight-{number}.mcap", 9, 10 * number)
+    clean(folder, 0)
+    assert {f"flight-{number}.mcap" for number in (3, 4, 7, 8, 9)} <= names(folder)
+    assert "flight-2.mcap" not in names(folder)
 
 
 def test_a_board_without_a_clock_keeps_its_newest_runs(tmp_path: Path) -> None:

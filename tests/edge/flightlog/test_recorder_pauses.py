@@ -95,6 +95,23 @@ def test_a_log_that_another_runner_began_meanwhile_is_neither_emptied_nor_delete
     assert first.close() and ticks(path) == [0]
 
 
+def test_a_log_that_another_runner_began_under_a_removed_name_is_not_deleted(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    waits = Recorder(path)
+    path.unlink()
+    drives = Recorder(path)
+    drives.put("/tick", 1, {"tick": 0})
+    close_log(waits, None, began=False, left_s=5.0)
+    assert drives.close() and ticks(path) == [0]
+
+
+def test_a_link_leads_to_the_log_that_is_made(tmp_path: Path) -> None:
+    (tmp_path / "latest.mcap").symlink_to(tmp_path / "flight.mcap")
+    recorder = Recorder(tmp_path / "latest.mcap")
+    recorder.put("/tick", 1, {"tick": 0})
+    assert recorder.close() and ticks(tmp_path / "flight.mcap") == [0]
+
+
 def test_a_device_can_be_recorded_to_and_is_never_deleted(monkeypatch: pytest.MonkeyPatch) -> None:
     removed: list[Path] = []
     monkeypatch.setattr(Path, "unlink", lambda path, **_: removed.append(path))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 import struct
@@ -10,6 +11,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import can
 import pytest
@@ -112,6 +114,22 @@ def test_a_line_that_takes_no_bytes_refuses_frames_without_waiting(tmp_path: Pat
     link.close()
     os.close(near)
     os.close(far)
+
+
+@pytest.mark.parametrize(("waiting", "after_ms", "taken"), [(512, 60_000, True), (1280, 39, True), (1280, 40, False)])
+def test_a_line_that_is_behind_for_40_ms_takes_no_more_frames(
+    line: PtyLine, monkeypatch: pytest.MonkeyPatch, waiting: int, after_ms: int, taken: bool
+) -> None:
+    now_ms, bus = [0], SerialLine(str(line.far))
+    clock = SimpleNamespace(monotonic_ns=lambda: now_ms[0] * 1_000_000)
+    monkeypatch.setattr("firmware_bridge.can.serial_line.time", clock)
+    frame = can.Message(arbitration_id=1, data=b"12", is_extended_id=False)
+    bus.send(frame)
+    monkeypatch.setattr(type(bus._ser), "out_waiting", waiting)
+    now_ms[0] = after_ms
+    with contextlib.nullcontext() if taken else pytest.raises(can.CanOperationError, match="takes no bytes"):
+        bus.send(frame)
+    bus.shutdown()
 
 
 def test_a_line_that_is_not_there_is_named_and_not_opened(tmp_path: Path) -> None:

@@ -205,6 +205,7 @@ class TestPermission:
     def test_it_expires_after_ten_seconds(self, rig: Rig, bridge: Running, repetitions: int) -> None:
         rig.reset()
         assert rig.operate("stop")[0] == 0
+        time.sleep(2.0)
 
         def once(number: int) -> dict[str, float]:
             client = BridgeClient(rig.socket)
