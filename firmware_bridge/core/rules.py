@@ -2,8 +2,9 @@
 
 States: disarmed -> arming -> armed -> stopped -> (explicit arm) arming ...
 * disarmed: the bridge sends nothing, with two exceptions. A robot found moving when the bridge starts is stopped, and a
-  base that holds its last command gets zeros then. An emergency stop of this computer sends a zero and a StopMotion; a
-  robot that moves when any is pressed is stopped (also after an arming that was broken off).
+  base that holds its last command gets zeros then. An emergency stop of this computer sends a zero and a StopMotion,
+  again each second while the local input is held and the robot drives itself; a robot that moves when any is pressed is
+  stopped (also after an arming that was broken off).
 * arming: the robot names its version and is made ready step by step, each confirmed by the mode it reports. A danger
   or a time-out refuses with a reason.
 * armed: the newest good command goes out at the bridge's own rate through limits and slew.
@@ -85,9 +86,8 @@ class BridgeCore:
         self._pressed = (False, False, False, False)
         self._pressed_ns = self._last_pressed_ns = self._told_ns = _NEVER_NS
         self._press_sent_ns = _NEVER_NS
-        self._pressed_here = (
-            False  # in this step, by an operator or at the local input, or held while the robot drives itself
-        )
+        # In this step, by an operator or at the local input; or held there while the robot drives itself.
+        self._pressed_here = False
         self._asleep_ns: int | None = None
         self._stop_sent_ns = self._stopped_ns = self._asked_ns = _NEVER_NS
         self._called: dict[int | None, int] = {}  # step -> when, during this arming
