@@ -10,7 +10,7 @@ import pytest
 from firmware_bridge.core.link import Arm, Release, Stop, Velocity
 from firmware_bridge.core.step_types import StopMotion
 from firmware_bridge.unitree.messages import ids
-from tests.support.robot.bridge_bench import SAFETY, ZERO, Bench
+from tests.support.robot.bridge_bench import MS, SAFETY, ZERO, Bench
 
 
 def _operator(bench: Bench) -> None:
@@ -68,6 +68,20 @@ class TestOperator:
         bench.wait(100)
         assert set(bench.moves()) == {ZERO}
         assert bench.status.rejected == 1
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_a_robot_that_drives_itself_is_stopped_each_second_while_the_local_input_is_held(held: bool) -> None:
+    bench = Bench()
+    _local_estop(bench)
+    bench.estop = held
+    bench.wait(2_000)
+    bench.written.clear()
+    for _ in range(160):
+        bench.step(drives_itself=True)
+        bench.now_ns += 20 * MS
+    stops = [request for _, request in bench.written if isinstance(request, StopMotion)]
+    assert stops == [StopMotion(pressed=True)] * 4 * held
 
 
 def _disarmed() -> Bench:
