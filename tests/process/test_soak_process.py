@@ -191,8 +191,11 @@ def test_timing_comes_from_ticks_and_the_wire(soaked: Soaked) -> None:
     # After a StopMove the bridge waits for the robot.
     gaps_ms = [b - a for (name, a), (_, b) in itertools.pairwise(stamps) if name == "Move"]
     off_ms = [abs(gap_ms - 20.0) for gap_ms in gaps_ms if 5.0 < gap_ms < 500.0]
-    assert found["bridge_jitter_ms.p50"]["count"] == len(off_ms) > 250
-    assert found["bridge_jitter_ms.p50"]["value"] == pytest.approx(statistics.median(off_ms), abs=0.01)
+    assert found["bridge_jitter_with_stalls_ms.max"]["count"] == len(off_ms) > 250
+    assert found["bridge_jitter_with_stalls_ms.max"]["value"] == pytest.approx(max(off_ms), abs=0.01)
+    # Less the machine's stalls, of which there are many while all cores are busy.
+    assert found["bridge_jitter_ms.p50"]["count"] == len(off_ms)
+    assert 0.0 <= found["bridge_jitter_ms.p50"]["value"] <= statistics.median(off_ms) + 0.01
 
 
 @pytest.mark.slow

@@ -372,6 +372,7 @@ def _append_bytes(name: str, data: bytes) -> Callable[[Path], None]:
 
 def _frames_that_are_no_pictures(data: Any) -> Callable[[Path], None]:
     def spoil(out: Path) -> None:
+        (out / "flight.mcap").unlink()  # a recorder overwrites no file
         recorder = Recorder(out / "flight.mcap")
         for semantic in synthetic_run.generations(6.0):
             recorder.put("/camera", semantic["anchor_ns"], {"data": data})
