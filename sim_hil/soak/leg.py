@@ -10,6 +10,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from math import hypot
@@ -78,6 +79,7 @@ class Leg:
     ) -> None:
         self.options = options
         self._journey = journey
+        self._planner = ThreadPoolExecutor(1)
         self._menu = menu
         self._stopped = stopped
         self._show_status = show_status
@@ -112,8 +114,8 @@ class Leg:
             },
         }
         events, samples = (folder / name for name in (EVENTS, SAMPLES))
-        # The stack first: it removes its sockets also where a file of the leg cannot be written.
-        with self._stack, events.open("a") as self._events, samples.open("a") as self._samples:
+        # The stack before the files: it removes its sockets also where a file of the leg cannot be written.
+        with self._planner, self._stack, events.open("a") as self._events, samples.open("a") as self._samples:
             (folder / LEG).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
             self._begin_ns = time.monotonic_ns()
             self._note("leg_begin", scene=self.options.stack.scene, people=self.options.stack.people)
@@ -177,6 +179,7 @@ class Leg:
         """Drive until the runner or the bridge ends (returns None) or the leg ends (returns why)."""
         runner, bridge = self._stack.runner, self._stack.bridge
         assert runner is not None and bridge is not None
+        planned: Future[SoakTask | None] | None = None
         pending: SoakTask | None = None
         send_ns = 0
         while runner.running and bridge.running:
@@ -189,7 +192,9 @@ class Leg:
                 return "duration"
             if end is not None:
                 self._end_task(end)
-                pending, send_ns = self._next_task(), now_ns
+                planned = self._plan_task()
+            if planned is not None and planned.done():
+                pending, planned, send_ns = planned.result(), None, now_ns
                 if pending is None:
                     return "no-task"
             if pending is not None and now_ns >= send_ns:
@@ -248,9 +253,18 @@ class Leg:
             self._read_truth()
             self._wait()
             time.sleep(POLL_S)
+        planned = self._plan_task()
+        while not planned.done():
+            self._wait()
+            time.sleep(POLL_S)
+        return planned.result()
+
+    def _plan_task(self) -> Future[SoakTask | None]:
+        """Begin to plan the next task from the robot's pose: samples and faults must not wait the seconds it takes."""
         self._read_truth()
         pose = self._truth.newest
-        return self._journey.next((pose.x_m, pose.y_m, pose.theta_rad))
+        assert pose is not None
+        return self._planner.submit(self._journey.next, (pose.x_m, pose.y_m, pose.theta_rad))
 
     def _begin_task(self, task: SoakTask) -> None:
         self._task = TaskRun(task, time.monotonic_ns())

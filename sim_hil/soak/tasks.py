@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 from math import hypot
 from typing import Any, Final
@@ -12,7 +14,7 @@ import numpy as np
 from sim_hil.benchmark.env.metrics import spl
 from sim_hil.benchmark.language.instructions import WordingError, wordings
 from sim_hil.benchmark.language.route import RouteError
-from sim_hil.benchmark.language.tasks import facing, goal_before, goals, make_task, sample_task
+from sim_hil.benchmark.language.tasks import Task, facing, goal_before, goals, make_task, sample_task
 from sim_hil.benchmark.suite.build import timeout_s
 from sim_hil.benchmark.suite.robots import robot_grid
 from sim_hil.realtime.truth import TruePose
@@ -89,17 +91,24 @@ class Journey:
         things = goals(self.scene)
         order = [things[int(index)] for index in self._rng.permutation(len(things))]
         seed = int(self._rng.integers(2**31))
+
+        @cache  # a route takes a quarter of a second to describe, and there are two rounds
+        def route_to(thing: SceneObject) -> Task | None:
+            try:
+                return make_task(self.scene, self._grid, begin, thing)
+            except RouteError:
+                return None
+
         for lengths_m in (self._length_m, LENGTH_M):
             for thing in order:
-                try:
-                    task = make_task(self.scene, self._grid, begin, thing)
-                    length_m = gap_m + _length_m(task.path)
-                    if lengths_m[0] <= length_m <= lengths_m[1]:
-                        first = facing(begin, task.path)
-                        text = wordings(task.route, 1, seed, held_out=True, first=first)[0]
-                        return self._task(at, task.goal, thing, length_m, text, first)
-                except (RouteError, WordingError):
+                task = route_to(thing)
+                length_m = 0.0 if task is None else gap_m + _length_m(task.path)
+                if task is None or not lengths_m[0] <= length_m <= lengths_m[1]:
                     continue
+                first = facing(begin, task.path)
+                with suppress(WordingError):
+                    text = wordings(task.route, 1, seed, held_out=True, first=first)[0]
+                    return self._task(at, task.goal, thing, length_m, text, first)
         for thing in order:
             goal = goal_before(self._grid, thing)
             path = None if goal is None else self._grid.path((begin[0], begin[1]), goal)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,7 +17,7 @@ from sim_hil.realtime.stack import StackOptions
 from sim_hil.realtime.truth import TruePose, read_lines
 from sim_hil.soak import leg as soak_leg
 from sim_hil.soak.faults import FaultMenu, SoakFault
-from sim_hil.soak.leg import CONTACT, EVENTS, Leg, LegOptions, explained_end
+from sim_hil.soak.leg import CONTACT, EVENTS, SAMPLES, Leg, LegOptions, explained_end
 from sim_hil.soak.tasks import SoakTask
 
 S = 1_000_000_000
@@ -35,6 +36,21 @@ class Clock:
         self.now_ns += round(seconds * S)
 
 
+class Planner:
+    """Executor whose work is done a while later on this clock."""
+
+    def __init__(self, clock: Clock, takes_s: float) -> None:
+        self._clock, self._takes_ns = clock, round(takes_s * S)
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def submit(self, work: Callable[..., Any], *arguments: Any) -> SimpleNamespace:
+        done_ns = self._clock.now_ns + self._takes_ns
+        return SimpleNamespace(done=lambda: self._clock.now_ns >= done_ns, result=partial(work, *arguments))
+
+
 MakeLeg = Callable[..., Leg]
 
 
@@ -45,9 +61,12 @@ def make_leg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> MakeLeg:
     def nothing(*_: object, **__: object) -> int:
         return 0
 
-    def make(clock: Clock, duration_s: float, *, menu: FaultMenu | None = None, end_s: float = math.inf) -> Leg:
+    def make(
+        clock: Clock, duration_s: float, *, menu: FaultMenu | None = None, end_s: float = math.inf, plan_s: float = 0.0
+    ) -> Leg:
         truth = SimpleNamespace(newest=pose, update=lambda: [TruePose(clock.now_ns, 0, 0, 0, ())])
         monkeypatch.setattr(soak_leg, "time", clock)
+        monkeypatch.setattr(soak_leg, "ThreadPoolExecutor", lambda _: Planner(clock, plan_s))
         monkeypatch.setattr(soak_leg, "Stack", lambda _: stack)
         monkeypatch.setattr(soak_leg, "TruthTail", lambda _: truth)
         options = LegOptions(
@@ -85,6 +104,24 @@ def test_an_instruction_is_sent_again_to_a_runner_too_busy_to_answer(
     kinds = [event["kind"] for event in read_lines(tmp_path / EVENTS) if event["kind"].startswith(("task", "not"))]
     assert kinds[:6] == ["task_begin", "task_end", "not_told", "not_told", "not_told", "task_begin"]
     assert all(b - a >= S for a, b in itertools.pairwise(sent_ns[:4]))
+
+
+def test_faults_and_samples_do_not_wait_for_the_plan_of_the_next_task(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make_leg: MakeLeg
+) -> None:
+    monkeypatch.setattr(soak_leg, "say", lambda *_: "accepted")
+    menu = FaultMenu((1.0, 2.0), (SoakFault("camera stops", "camera-stop", (1.0, 1.0), 1.0, "", "zero"),))
+
+    assert make_leg(Clock(), 60.0, menu=menu, plan_s=20.0).run() == "duration"
+
+    events = list(read_lines(tmp_path / EVENTS))
+    ended_ns = next(event["t_ns"] for event in events if event["kind"] == "task_end")
+    begun_ns = next(e["t_ns"] for e in events if e["kind"] == "task_begin" and e["t_ns"] > ended_ns)
+    assert begun_ns - ended_ns >= 20 * S
+    faults = [e["t_ns"] for e in events if e["kind"].startswith("fault_o") and ended_ns < e["t_ns"] < begun_ns]
+    assert len(faults) > 10 and max(b - a for a, b in itertools.pairwise(faults)) < 2.2 * S
+    samples = [sample["t_ns"] for sample in read_lines(tmp_path / SAMPLES)]
+    assert max(b - a for a, b in itertools.pairwise(samples)) < 1.2 * S
 
 
 @pytest.mark.parametrize(("duration_s", "injected"), [(600.0, True), (7200.0, False)])
