@@ -6,15 +6,15 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
-from math import hypot
+from math import hypot, inf
 from typing import Any, Final
 
 import numpy as np
 
 from sim_hil.benchmark.env.metrics import spl
 from sim_hil.benchmark.language.instructions import WordingError, wordings
-from sim_hil.benchmark.language.route import RouteError
-from sim_hil.benchmark.language.tasks import Task, facing, goal_before, goals, make_task, sample_task
+from sim_hil.benchmark.language.route import RouteError, describe_route
+from sim_hil.benchmark.language.tasks import facing, goal_before, goals, path_to, sample_task
 from sim_hil.benchmark.suite.build import timeout_s
 from sim_hil.benchmark.suite.robots import robot_grid
 from sim_hil.realtime.truth import TruePose
@@ -92,30 +92,36 @@ class Journey:
         order = [things[int(index)] for index in self._rng.permutation(len(things))]
         seed = int(self._rng.integers(2**31))
 
-        @cache  # a route takes a quarter of a second to describe, and there are two rounds
-        def route_to(thing: SceneObject) -> Task | None:
+        @cache  # a search of a tenth of a second
+        def goal_path(thing: SceneObject) -> tuple[Vec2, tuple[Vec2, ...], float] | None:
+            """Point before a landmark, the path to it and its length."""
             try:
-                return make_task(self.scene, self._grid, begin, thing)
+                goal, path = path_to(self._grid, begin, thing)
             except RouteError:
                 return None
+            return goal, path, gap_m + _length_m(path)
 
         for lengths_m in (self._length_m, LENGTH_M):
             for thing in order:
-                task = route_to(thing)
-                length_m = 0.0 if task is None else gap_m + _length_m(task.path)
-                if task is None or not lengths_m[0] <= length_m <= lengths_m[1]:
+                if self._straight_m(at, thing) > lengths_m[1] or (found := goal_path(thing)) is None:
                     continue
-                first = facing(begin, task.path)
-                with suppress(WordingError):
-                    text = wordings(task.route, 1, seed, held_out=True, first=first)[0]
-                    return self._task(at, task.goal, thing, length_m, text, first)
+                goal, path, length_m = found
+                if not lengths_m[0] <= length_m <= lengths_m[1]:
+                    continue
+                first = facing(begin, path)
+                with suppress(RouteError, WordingError):
+                    route = describe_route(self.scene, self._grid, list(path), thing)
+                    text = wordings(route, 1, seed, held_out=True, first=first)[0]
+                    return self._task(at, goal, thing, length_m, text, first)
         for thing in order:
-            goal = goal_before(self._grid, thing)
-            path = None if goal is None else self._grid.path((begin[0], begin[1]), goal)
-            if goal is None or path is None or (length_m := gap_m + _length_m(tuple(path))) < LENGTH_M[0]:
-                continue
-            return self._task(at, goal, thing, length_m, f"Go to the {thing.landmark}.", facing(begin, path))
+            if (found := goal_path(thing)) is not None and found[2] >= LENGTH_M[0]:
+                goal, path, length_m = found
+                return self._task(at, goal, thing, length_m, f"Go to the {thing.landmark}.", facing(begin, path))
         return None
+
+    def _straight_m(self, at: Vec3, thing: SceneObject) -> float:
+        goal = goal_before(self._grid, thing)
+        return inf if goal is None else hypot(goal[0] - at[0], goal[1] - at[1])
 
     def _task(self, at: Vec3, goal: Vec2, thing: SceneObject, length_m: float, text: str, first: str) -> SoakTask:
         self._count += 1

@@ -54,6 +54,12 @@ def goal_before(grid: NavGrid, thing: SceneObject) -> Vec2 | None:
 
 def make_task(scene: Scene, grid: NavGrid, start: Vec3, thing: SceneObject) -> Task:
     """Create the task from a start to a landmark. Raises RouteError if it is not feasible or not describable."""
+    goal, path = path_to(grid, start, thing)
+    return Task(start, goal, thing.label, path, describe_route(scene, grid, list(path), thing))
+
+
+def path_to(grid: NavGrid, start: Vec3, thing: SceneObject) -> tuple[Vec2, tuple[Vec2, ...]]:
+    """Return the point at which to stop for a landmark and the path to it. Raises RouteError if there is none."""
     goal = goal_before(grid, thing)
     if goal is None:
         raise RouteError(f"there is no room before the {thing.landmark}")
@@ -65,8 +71,7 @@ def make_task(scene: Scene, grid: NavGrid, start: Vec3, thing: SceneObject) -> T
         path = grid.path((start[0], start[1]), goal)
         if path is None:
             raise RouteError(f"there is no path to the {thing.landmark}")
-    route = describe_route(scene, grid, path, thing)
-    return Task(start, goal, thing.label, tuple(path), route)
+    return goal, tuple(path)
 
 
 def _first_beside(grid: NavGrid, thing: SceneObject, path: list[Vec2]) -> Vec2 | None:
