@@ -158,7 +158,8 @@ def run(args: argparse.Namespace, say: Callable[[str], None], host: Host | None 
     verdict = host.check([path for path in contents if path.suffix == ".service"])
     _report(verdict, say)
     commands = _commands(contents, inputs, system=args.system)
-    say("nothing was enabled or started. To do so; the last command lets the robot stand up and drive:")
+    say("nothing was enabled or started. To do so, while the robot stands: a service that runs already is ended and")
+    say("started again. The last command lets the robot stand up and drive:")
     for command in commands:
         say(f"  {command}")
     stop = _bridge_command("stop", inputs)
@@ -330,16 +331,16 @@ def _commands(contents: Mapping[Path, str], inputs: units.ServiceInputs, *, syst
     )
     prepare += ["sudo systemd-sysusers", f'sudo usermod -aG {inputs.users.operators} "$USER"']
     firewall = [path.name for path in contents if path.name == units.FIREWALL_UNIT]
+    # Restarted, not started: a service that runs already would keep the instruction and limits of its old unit.
+    services = [*firewall, units.BRIDGE_UNIT, units.RUNNER_UNIT]
     # Not enabled if it arms by itself: after a brown-out the machine must not drive before a person has checked it.
-    drive = [f"sudo systemctl start {units.RUNNER_UNIT}"]
-    if inputs.operator_arm:
-        drive = [f"sudo systemctl enable --now {units.RUNNER_UNIT}", _bridge_command("arm", inputs)]
+    enabled = services if inputs.operator_arm else services[:-1]
     return [
         *prepare,
         "sudo systemctl daemon-reload",
-        *(f"sudo systemctl {command} {unit}" for unit in firewall for command in ("enable", "restart")),
-        f"sudo systemctl enable --now {units.BRIDGE_UNIT}",
-        *drive,
+        *(f"sudo systemctl enable {unit}" for unit in enabled),
+        *(f"sudo systemctl restart {unit}" for unit in services),
+        *([_bridge_command("arm", inputs)] if inputs.operator_arm else []),
     ]
 
 

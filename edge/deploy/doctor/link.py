@@ -14,7 +14,7 @@ from edge.deploy.doctor.check import Check, Level, skipped
 from edge.deploy.doctor.rights import UserRights
 from edge.deploy.link_rights import SERIAL_GROUP, serial_device
 from edge.deploy.unit_check import run_command
-from edge.deploy.units import FIREWALL_FILE, FIREWALL_FOLDER, FIREWALL_UNIT
+from edge.deploy.units import FIREWALL_FILE, FIREWALL_FOLDER
 from firmware_bridge.backends import INSTALL
 from firmware_bridge.core.config import ConfigError, RobotConfig
 
@@ -65,7 +65,7 @@ def cable(interface: str, root: Path) -> Check:
         return Check(name, Level.WARN, f"the default route leads over {interface}", _OWN_CABLE, advice)
     rules = FIREWALL_FOLDER / FIREWALL_FILE
     if not (root / rules.relative_to("/")).exists():
-        advice = f"edge-install units writes it; sudo systemctl enable --now {FIREWALL_UNIT} loads it"
+        advice = f"edge-install units writes it; its printed commands load it"
         return Check(name, Level.WARN, f"{interface}, without {rules}", _OWN_CABLE, advice)
     return Check(name, Level.OK, f"{interface}; {rules} is there", _OWN_CABLE)
 

@@ -87,9 +87,10 @@ def test_it_writes_both_units_and_the_user_and_prints_the_start_command(units: U
     assert {path.name for path in (tmp_path / "units").iterdir()} == expected
     assert result is not None
     assert result["exposure"] == GOOD.exposure
-    assert result["commands"][-3:-1] == [
-        f"sudo systemctl enable --now {BRIDGE_UNIT}",
-        f"sudo systemctl enable --now {RUNNER_UNIT}",
+    services = (FIREWALL_UNIT, BRIDGE_UNIT, RUNNER_UNIT)
+    assert result["commands"][-7:-1] == [
+        *(f"sudo systemctl enable {unit}" for unit in services),
+        *(f"sudo systemctl restart {unit}" for unit in services),  # one that runs keeps its old unit otherwise
     ]
     arm = f"sudo {tmp_path}/bin/edge-bridge arm --robot {tmp_path}/go2.toml --socket {SOCKET}"
     assert result["commands"][-1] == arm
@@ -139,7 +140,7 @@ def test_a_robot_that_would_drive_as_soon_as_its_service_starts_is_refused_in_on
 
 def test_with_consent_it_is_written_and_not_enabled_at_boot(units: Units, alone: Path, tmp_path: Path) -> None:
     code, result = units("--arm-at-start", robot=alone)
-    assert (code, result and result["commands"][-1]) == (EXIT_DONE, f"sudo systemctl start {RUNNER_UNIT}")
+    assert (code, result and result["commands"][-1]) == (EXIT_DONE, f"sudo systemctl restart {RUNNER_UNIT}")
     assert result is not None
     assert not any("enable" in command and RUNNER_UNIT in command for command in result["commands"])
     text = (tmp_path / "units" / RUNNER_UNIT).read_text()
