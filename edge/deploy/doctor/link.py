@@ -65,7 +65,7 @@ def cable(interface: str, root: Path) -> Check:
         return Check(name, Level.WARN, f"the default route leads over {interface}", _OWN_CABLE, advice)
     rules = FIREWALL_FOLDER / FIREWALL_FILE
     if not (root / rules.relative_to("/")).exists():
-        advice = f"edge-install units writes it; its printed commands load it"
+        advice = "edge-install units writes it; its printed commands load it"
         return Check(name, Level.WARN, f"{interface}, without {rules}", _OWN_CABLE, advice)
     return Check(name, Level.OK, f"{interface}; {rules} is there", _OWN_CABLE)
 
