@@ -202,10 +202,11 @@ def _plan(sources: Sequence[Source], wanted: dict[str, tuple[int, ...]], config:
 def _account(plan: _Plan, wanted: dict[str, tuple[int, ...]], fill_seed: int | None) -> Coverage:
     given = {name.split(".")[0] for name in plan.recipes}
     seeded = {}
+    action_seed = None if "action" in given else fill_seed
     if "value" not in given:
-        seeded["value"] = VALUE_SEED if fill_seed is None else fill_seed
-    if "action" not in given and fill_seed is not None:
-        seeded["action"] = fill_seed
+        seeded["value"] = VALUE_SEED if action_seed is None else action_seed
+    if action_seed is not None:
+        seeded["action"] = action_seed
     missing, misshaped = [], []
     for name, shape in wanted.items():
         if name.split(".")[0] in seeded:

@@ -13,7 +13,7 @@ from edge.artifacts.files import MANIFEST_NAME, ArtifactError, read_manifest
 from export.checkpoint.load import Coverage, LoadedCheckpoint, load_checkpoint, shipped_weights
 from export.checkpoint.sources import open_source
 from export.core.cache import file_sha256
-from export.evaluation.calibration import CalibrationSet, load_calibration
+from export.evaluation.calibration import CalibrationError, CalibrationSet, load_calibration
 from export.evaluation.task_samples import check_clips
 from export.model.config import (
     ModelConfigError,
@@ -31,7 +31,7 @@ from export.targets.sections import TargetError
 DEFAULT_SEED = 0
 WHOLLY_RANDOM = re.compile(r"random seed (\d{1,19})")
 FILLED = re.compile(r"(?:^|; )action: random seed (\d{1,19})")
-DIRECTORY_FILES = ("config.json", "tokenizer.json")
+DIRECTORY_FILES = ("config.json", "preprocessor_config.json", "tokenizer.json")
 """Files of a Hugging Face directory that are read beside its weights."""
 
 
@@ -55,13 +55,14 @@ class WeightSource:
 
         Raises CheckpointError.
         """
-        files: dict[str, str] = {}
+        # A list in the order of reading: two checkpoints may have files of the same name.
+        files: list[tuple[str, str]] = []
         for path in self._checkpoints:
             source = open_source(path)
-            files |= {label: file_sha256(file) for label, file in source.files.items()}
+            files += [(label, file_sha256(file)) for label, file in source.files.items()]
             if source.directory is not None:
                 beside = [source.directory / name for name in DIRECTORY_FILES]
-                files |= {f"{source.label}/{p.name}": file_sha256(p) for p in beside if p.is_file()}
+                files += [(f"{source.label}/{p.name}", file_sha256(p)) for p in beside if p.is_file()]
         return {"files": files, "seed": self._seed, "config": self.config.to_dict()}
 
     @cached_property
@@ -110,9 +111,9 @@ def job_of(
 ) -> tuple[Job, list[str]]:
     """Return the job that a directory's manifest records, and notes for the user.
 
-    Raises ArtifactError, WeightsError. Target and network are loaded by the recorded names, with the recorded `--set`:
-    the manifest's own copies could have been changed. The user must name weight files again, because a manifest keeps
-    no paths.
+    Raises ArtifactError, WeightsError, CalibrationError. Target and network are loaded by the recorded names, with the
+    recorded `--set`: the manifest's own copies could have been changed. The user must name weight files again, and a
+    calibration of their own, because a manifest keeps no paths.
     """
     manifest = read_manifest(directory)
     where = directory / MANIFEST_NAME
@@ -137,6 +138,8 @@ def job_of(
             seed = int(random[1])
     elif seed is None and filled is not None:
         seed = int(filled[1])
+    if calibration is None and ":" in name:  # a manifest keeps no paths
+        raise CalibrationError(f"{directory}: built with calibration {name}; pass the same with --calibration")
     found = load_calibration(calibration or name)
     if found.sha256 != sha256:
         raise ArtifactError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from export.model import weights
 from export.model.config import PRESETS
 from export.model.network import TicVla, build
 from export.model.weights import CheckpointError, WeightsInfo, save_weights, weights_sha256
+from export.pipeline.job import WeightSource
 from tests.support.export.internvl import CONFIG, hf_model, original_config, refusal, write_directory
 
 NANO = PRESETS["nano"]
@@ -112,6 +114,43 @@ def test_an_absent_value_network_is_reported(vlm: Path, model: TicVla, tmp_path:
     assert loaded.coverage.seeded == {"value": 0}
     assert loaded.info.trained
     assert "value: random seed 0" in loaded.info.origin
+
+
+def test_a_seed_beside_a_whole_checkpoint_changes_nothing(vlm: Path, model: TicVla, tmp_path: Path) -> None:
+    path = tmp_path / "expert.safetensors"
+    save_weights(model, path, WeightsInfo(trained=True, origin=""), parts=("action",))
+    with_seed, without = (load_checkpoint([vlm, path], CONFIG, fill_seed=seed) for seed in (5, None))
+    assert weights_sha256(with_seed.model) == weights_sha256(without.model)
+    assert with_seed.info == without.info  # which is all that an artifact keeps
+
+
+@pytest.mark.parametrize("changed", ["model.safetensors", "config.json", "preprocessor_config.json", "tokenizer.json"])
+def test_every_file_of_a_directory_is_part_of_the_fingerprint(vlm: Path, changed: str) -> None:
+    before = WeightSource(CONFIG, [vlm], 0).fingerprint()
+    (vlm / changed).touch()
+    content = (vlm / changed).read_bytes()
+    # A header may end in spaces; JSON, too.
+    (vlm / changed).write_bytes(_with_a_space(content) if changed.endswith("safetensors") else content + b" ")
+    assert WeightSource(CONFIG, [vlm], 0).fingerprint() != before
+
+
+def test_checkpoints_of_one_name_and_another_order_have_other_fingerprints(expert: Path, tmp_path: Path) -> None:
+    """vlm/model.safetensors, action/model.safetensors: each counts, though both have the same name."""
+    paths = [tmp_path / folder / "model.safetensors" for folder in ("vlm", "action")]
+    for path in paths:
+        path.parent.mkdir(exist_ok=True)
+        shutil.copy(expert, path)
+    same = WeightSource(CONFIG, paths, None).fingerprint()
+    paths[0].write_bytes(_with_a_space(paths[0].read_bytes()))
+    other = WeightSource(CONFIG, paths, None).fingerprint()
+    assert len({json.dumps(found, sort_keys=True) for found in (same, other)}) == 2
+    assert WeightSource(CONFIG, paths[::-1], None).fingerprint() != other
+
+
+def _with_a_space(content: bytes) -> bytes:
+    """The same tensors in a safetensors file whose header ends in a space more."""
+    length = int.from_bytes(content[:8], "little")
+    return (length + 1).to_bytes(8, "little") + content[8 : 8 + length] + b" " + content[8 + length :]
 
 
 def test_the_origin_names_files_and_hashes_but_no_place(vlm: Path, expert: Path, tmp_path: Path) -> None:
