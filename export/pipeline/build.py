@@ -115,7 +115,7 @@ def build_stages(job: Job, known_s: Mapping[str, float], *, graphs: bool = True)
     names += [f"precision {graph}" for graph in searched]
     if graphs:
         vision = job.target.graphs["vision_encoder"]
-        if vision.form == "plain" and "int8" in (vision.precision, *vision.candidates):
+        if vision.form == "plain" and "int8" in (vision.precision, *vision.candidates, *vision.overrides.values()):
             names += ["activation ranges"]
         names += [f"graph {graph}" for graph in order]
     names += [*(f"gate {graph}" for graph in order), *(["self-test", "plan and report"] if graphs else [])]
@@ -228,10 +228,8 @@ class Pipeline:
 
     def _task_key(self) -> str:
         offsets = list(self.job.target.runtime.frame_offsets_s)
-        calibration, tokenizer = self.job.calibration.sha256, hashlib.sha256(self.tokenizer()).hexdigest()
-        parts = self._parts(
-            calibration=calibration, tokenizer=tokenizer, frame_offsets_s=offsets, new_tokens=NEW_TOKENS
-        )
+        used, tokenizer = self.job.calibration.sha256, hashlib.sha256(self.tokenizer()).hexdigest()
+        parts = self._parts(calibration=used, tokenizer=tokenizer, frame_offsets_s=offsets, new_tokens=NEW_TOKENS)
         return self._key("task", parts, TASK_CODE, Pipeline.task_reference)
 
     def task_reference(self) -> Path:
@@ -285,10 +283,8 @@ class Pipeline:
         )
 
         def choose() -> dict[str, Any]:
-            speed_first = graph in COMPUTING
-            return self._search.choose(
-                graph, policy.candidates, limits, measured=points, speed_first=speed_first
-            ).to_dict()
+            search, first = self._search, graph in COMPUTING
+            return search.choose(graph, policy.candidates, limits, measured=points, speed_first=first).to_dict()
 
         return self._json_stage(f"precision {graph}", key, choose)
 
@@ -381,6 +377,8 @@ class Pipeline:
             "reference": reference,
             "threads": self._threads,
             "machine": machine_name(),
+            # The language model's check generates as the runner does, in chunks of the manifest's size.
+            "runtime": repr(artifacts.runtime) if {*graphs} & {*LANGUAGE_WHOLE, *LANGUAGE_PAIR} else None,
         }
         key = stage_key(what, parts, GATE_CODE)
         if not self._run_gates:

@@ -215,7 +215,11 @@ def test_an_interrupted_export_leaves_nothing_half_written_and_goes_on_where_it_
 ) -> None:
     cache, out = tmp_path / "cache", tmp_path / "out" / "nano"
     command = [sys.executable, "-m", "export.cli", *RANDOM, "--out", str(out), "--cache", str(cache)]
-    for number, stage in ((signal.SIGINT, "gate vision_encoder"), (signal.SIGTERM, "gate action_expert")):
+    for number, stage in (
+        (signal.SIGINT, "gate vision_encoder"),
+        (signal.SIGHUP, "gate semantic_context"),
+        (signal.SIGTERM, "gate action_expert"),
+    ):
         export_interrupted_by(number, command, stage)
         assert not any(out.parent.iterdir())
         assert [path for path in cache.iterdir() if path.name.endswith(".partial")] == []
@@ -227,6 +231,22 @@ def test_an_interrupted_export_leaves_nothing_half_written_and_goes_on_where_it_
     assert "gate vision_encoder: from the cache" in done.stderr
     assert done.stdout == ""
     subprocess.run(["diff", "-r", str(nano_dir), str(out)], check=True, timeout=300)
+
+
+def test_a_result_of_the_language_models_check_counts_for_its_chunks_alone(
+    artifacts_dir: Path, cache: StageCache, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The check generates as the runner does; the other graphs' checks do not depend on the runner's settings."""
+    artifacts = load_artifacts(artifacts_dir)
+    longer = replace(artifacts, runtime=replace(artifacts.runtime, prefill_chunk_tokens=999))
+    keys: list[str] = []
+    monkeypatch.setattr(StageCache, "result", lambda _, key, __: (keys.append(key), True))
+    pipeline = Pipeline(job(), cache, progress())
+    for graph, different in (("language_model", 2), ("action_expert", 1)):
+        keys.clear()
+        for each in (artifacts, longer):
+            pipeline._measured("task", each, (graph,), "reference", pytest.fail)
+        assert len(set(keys)) == different
 
 
 @pytest.mark.slow
