@@ -113,18 +113,20 @@ def workplace(out: Path) -> Iterator[Path]:
                 shutil.rmtree(work / left, ignore_errors=True)
             yield work
         finally:
+            if (work / OLD).exists() and not out.exists():  # interrupted between the two renames
+                (work / OLD).rename(out)
             shutil.rmtree(work, ignore_errors=True)
     finally:
         os.close(descriptor)
 
 
 def _swap(made: Path, out: Path, retired: Path) -> None:
-    if out.exists():
-        out.rename(retired)
     try:
+        if out.exists():
+            out.rename(retired)
         made.rename(out)
-    except BaseException:
-        if retired.exists():
+    except BaseException:  # Ctrl-C may come after either rename
+        if retired.exists() and not out.exists():
             retired.rename(out)
         raise
     fsync_path(out.parent)

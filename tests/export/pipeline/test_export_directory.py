@@ -15,7 +15,7 @@ from edge.artifacts.manifest import load_artifacts
 from export.cli import main
 from export.core.cache import StageCache
 from export.core.replaceable import check_replaceable
-from export.pipeline.artifacts import build_artifacts, workplace
+from export.pipeline.artifacts import NEW, OLD, _swap, build_artifacts, workplace
 from tests.support.export.export_job import job, manifest, progress
 
 
@@ -47,6 +47,44 @@ def test_a_failed_swap_puts_the_old_directory_back(
         build_artifacts(job(), out, cache, progress())
     assert [p.name for p in tmp_path.iterdir()] == ["nano"]
     load_artifacts(out)
+
+
+@pytest.mark.parametrize("renamed", [1, 2])
+@pytest.mark.parametrize("done", [False, True])
+def test_an_interrupt_of_the_swap_leaves_one_whole_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, renamed: int, done: bool
+) -> None:
+    """Ctrl-C before or after each of the two renames."""
+    out, rename, count = tmp_path / "nano", Path.rename, 0
+    out.mkdir()
+    (out / "first").touch()
+
+    def interrupted(self: Path, target: Path) -> Path:
+        nonlocal count
+        count += 1
+        if count == renamed and not done:
+            raise KeyboardInterrupt
+        moved = rename(self, target)
+        if count == renamed:
+            raise KeyboardInterrupt
+        return moved
+
+    with workplace(out) as work:
+        (work / NEW).mkdir()
+        (work / NEW / "second").touch()
+        monkeypatch.setattr(Path, "rename", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            _swap(work / NEW, out, work / OLD)
+    expected = "second" if (renamed, done) == (2, True) else "first"
+    assert [path.name for path in out.iterdir()] == [expected]
+    assert [path.name for path in tmp_path.iterdir()] == ["nano"]
+
+
+def test_an_error_after_the_first_rename_is_undone_with_the_workplace(tmp_path: Path) -> None:
+    (tmp_path / "nano").mkdir()
+    with workplace(tmp_path / "nano") as work:
+        (tmp_path / "nano").rename(work / OLD)
+    assert [path.name for path in tmp_path.iterdir()] == ["nano"]
 
 
 @pytest.mark.slow
