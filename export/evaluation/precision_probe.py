@@ -161,6 +161,8 @@ class VisionProbe(Probe):
         visual = list(r.visual)
         index = group.split(".")[1] if group.startswith("blocks.") else None
         for frame in self._scan_frames:
+            if frame not in self._inputs:  # before anything is rounded
+                self._inputs[frame] = self._inputs_of(frame)
             with torch.no_grad(), self._rounded(vision, Precision("fp32", ((group, precision),))):
                 if group.startswith("embed"):
                     tokens = vision(torch.from_numpy(r.samples.frames[frame]))
@@ -179,18 +181,21 @@ class VisionProbe(Probe):
         moved = [base + found - expected for base, found, expected in zip(r.plans, plans, exact, strict=True)]
         return r.reading(moved, max(errors))
 
+    def _inputs_of(self, frame: int) -> list[Tensor]:
+        """Return the input of every block, and the output of the last one."""
+        vision, inputs = self.reference.model.vision, list[Tensor]()
+        hooks = [b.register_forward_pre_hook(lambda _m, x: inputs.append(x[0])) for b in vision.blocks]
+        hooks.append(vision.blocks[-1].register_forward_hook(lambda _m, _x, y: inputs.append(y)))
+        try:
+            with torch.no_grad():
+                vision(torch.from_numpy(self.reference.samples.frames[frame]))
+        finally:
+            for hook in hooks:
+                hook.remove()
+        return inputs
+
     def _from_block(self, frame: int, start: int) -> Tensor:
         vision = self.reference.model.vision
-        if frame not in self._inputs:
-            self._inputs[frame] = []
-            into = self._inputs[frame]
-            hooks = [b.register_forward_pre_hook(lambda _m, x: into.append(x[0])) for b in vision.blocks]
-            hooks.append(vision.blocks[-1].register_forward_hook(lambda _m, _x, y: into.append(y)))
-            try:
-                vision(torch.from_numpy(self.reference.samples.frames[frame]))
-            finally:
-                for hook in hooks:
-                    hook.remove()
         x = self._inputs[frame][start]
         for block in vision.blocks[start:]:
             x = block(x)
