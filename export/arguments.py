@@ -140,3 +140,5 @@ def _check_verify(args: argparse.Namespace) -> None:
         raise UsageError(f"verify: {ignored[0]} has no effect on existing artifacts; leave it out")
     if not args.directory.is_dir():
         raise UsageError(f"verify {args.directory}: not a directory; create it with edge-export --out")
+    if args.json not in (None, "-") and args.directory.resolve() in Path(os.path.realpath(args.json)).parents:
+        raise UsageError(f"--json {args.json}: lies inside the directory to verify; name a path outside it")

@@ -29,7 +29,7 @@ from edge.core.cli import (
     write_result,
 )
 from export.arguments import COMMAND, DEFAULT_MODEL, DEFAULT_TARGET, UsageError, check, parser, target_and_config
-from export.core.cache import StageCache, default_cache_dir, open_cache
+from export.core.cache import StageCache, default_cache_dir, open_cache, remove_abandoned
 from export.evaluation.calibration import CalibrationError, load_calibration
 from export.evaluation.gates import GateError
 from export.model.config import PRESETS, ModelConfigError, TicVlaConfig
@@ -47,6 +47,8 @@ from firmware_bridge.system.terminal import one_line
 from reporting.progress import BuildProgress, peak_rss_bytes
 
 DEFAULT_CALIBRATION = "corridor-go2"
+_TEMPORARY = ".edge-export-"
+"""Prefix of a `--no-cache` export's folder of stages, beside its output."""
 BAD_INPUT = (ArtifactError, CalibrationError, ModelConfigError, WeightsError, TargetError, OSError)
 
 
@@ -84,10 +86,13 @@ def _export(args: argparse.Namespace) -> dict[str, Any] | None:
     if args.dry_run:
         return None
     out = Path(os.path.realpath(args.out))
+    written: dict[Path, str] = {}
     for option, path in (("--save-weights", args.save_weights), ("--json", args.json)):
         if path is None or str(path) == "-":
             continue
         real = Path(os.path.realpath(path))
+        if (other := written.setdefault(real, option)) != option:
+            raise UsageError(f"{option} {path}: is also the file of {other}; name another one")
         if real == out or out in real.parents:
             raise UsageError(
                 f"{option} {path}: lies inside --out, which is replaced as a whole; name a path outside it"
@@ -132,8 +137,9 @@ def _cache(args: argparse.Namespace, beside: Path | None) -> Iterator[StageCache
     if args.no_cache:
         if beside is not None:
             beside.mkdir(parents=True, exist_ok=True)
+            remove_abandoned(beside, _TEMPORARY)
         with (
-            tempfile.TemporaryDirectory(prefix=".edge-export-", dir=beside) as directory,
+            tempfile.TemporaryDirectory(prefix=_TEMPORARY, dir=beside) as directory,
             open_cache(Path(directory), limit_bytes, _log) as cache,
         ):
             yield cache
@@ -155,12 +161,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run `edge-export` and return its exit code."""
     args = parser().parse_args(argv)
     started_ns = time.monotonic_ns()
-    # SIGTERM ends the export like Ctrl-C: partial output is deleted, finished stages stay in the cache.
-    previous = signal.signal(signal.SIGTERM, _interrupt)
+    # They end the export like Ctrl-C: partial output is deleted, finished stages stay in the cache.
+    ending = [s for s in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(s) is not signal.SIG_IGN]  # nohup ignores
+    previous = {number: signal.signal(number, _interrupt) for number in ending}
     try:
         return _main(args, started_ns)
     finally:
-        signal.signal(signal.SIGTERM, previous)
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 def _interrupt(_signal: int, _frame: object) -> None:

@@ -154,6 +154,16 @@ def open_cache(directory: Path, limit_bytes: int, log: Callable[[str], None]) ->
         os.close(descriptor)
 
 
+def remove_abandoned(folder: Path, prefix: str) -> None:
+    """Remove caches in `folder` whose names begin with `prefix` and that no process has open: it was killed."""
+    for directory in folder.glob(f"{prefix}*"):
+        if directory.is_symlink() or not (directory / _MARKER_NAME).is_file():
+            continue
+        with (directory / _LOCK_NAME).open("a") as lock, suppress(BlockingIOError):
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(directory, ignore_errors=True)
+
+
 def _claim(directory: Path) -> None:
     """Mark a directory as a cache. Raises CacheError if it holds other files."""
     marker = directory / _MARKER_NAME

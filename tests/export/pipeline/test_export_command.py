@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from export.cli import main
-from export.pipeline.build import with_exceptions
+from export.pipeline.build import build_stages, with_exceptions
 from export.quantize.precision import Precision
 from export.targets.file import list_targets
-from tests.support.export.export_job import manifest
+from tests.support.export.export_job import TARGET, job, manifest
 
 LOOSE = [
     f"--set=gates.vision_encoder.{key}" for key in ("min_cosine=0.9", "warn_cosine=0.9", "max_abs=10")
@@ -85,6 +86,29 @@ def test_the_exact_exceptions_of_a_target_win_over_what_the_search_chose(
     found = with_exceptions(Precision("int4-b128", chosen), Precision("int4-b32", asked))
     assert found == Precision("int4-b128", tuple(shipped.items()))
     assert found == Precision.from_dict(found.to_dict())
+
+
+def test_weights_and_result_are_not_written_to_one_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    both = str(tmp_path / "x")
+    assert main(["--out", str(tmp_path / "nano"), "--save-weights", both, "--json", both]) == 2
+    refusal = f"edge-export: --json {both}: is also the file of --save-weights; name another one\n"
+    assert capsys.readouterr().err == refusal
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("precision", "overrides", "expected"),
+    [("fp32", {}, False), ("int8", {}, True), ("fp32", {"blocks.0.qkv": "int8"}, True)],
+)
+def test_a_plain_encoder_with_a_layer_in_int8_has_a_stage_for_its_ranges(
+    precision: str, overrides: dict[str, str], expected: bool
+) -> None:
+    vision = replace(
+        TARGET.graphs["vision_encoder"], form="plain", candidates=(), precision=precision, overrides=overrides
+    )
+    target = replace(TARGET, graphs={**TARGET.graphs, "vision_encoder": vision})
+    stages = [stage.name for stage in build_stages(replace(job(), target=target), {})]
+    assert ("activation ranges" in stages) == expected
 
 
 @pytest.mark.slow

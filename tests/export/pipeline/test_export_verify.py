@@ -16,7 +16,7 @@ import pytest
 
 from edge.artifacts.files import seal
 from edge.artifacts.known_answers import LATER
-from edge.artifacts.manifest import Artifacts
+from edge.artifacts.manifest import Artifacts, load_artifacts
 from edge.core.cli import EXIT_CHECK_FAILED
 from edge.inference.self_test import SelfTestError
 from edge.inference.start_guard import Memory, StartGuard
@@ -228,6 +228,25 @@ def test_a_directory_for_a_users_target_names_the_origin_of_its_thresholds(
 def test_verify_refuses_artifacts_of_other_weights(artifacts_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["verify", str(artifacts_dir), "--random-weights", "5"]) == 1
     assert "other weights" in capsys.readouterr().err
+
+
+def test_verify_of_a_folder_of_pictures_asks_for_the_folder(
+    artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))
+    resealed(copy, "provenance/calibration/name", "folder:corridor")
+    assert main(["verify", str(copy)]) == 2
+    expected = f"edge-export: {copy}: built with calibration folder:corridor; pass the same with --calibration\n"
+    assert capsys.readouterr().err == expected
+
+
+def test_verify_writes_no_result_into_the_directory_that_it_verifies(
+    artifacts_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = Path(shutil.copytree(artifacts_dir, tmp_path / "nano"))
+    assert main(["verify", str(copy), "--json", str(copy / "result.json")]) == 2
+    assert "lies inside the directory to verify" in capsys.readouterr().err
+    load_artifacts(copy)
 
 
 @pytest.fixture(scope="module")

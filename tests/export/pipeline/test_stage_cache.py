@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from export.core import cache as stages
-from export.core.cache import CacheError, StageCache, open_cache, stage_key
+from export.core.cache import CacheError, StageCache, open_cache, remove_abandoned, stage_key
 
 GIB = 1 << 30
 CODE = ("export.quantize.precision",)
@@ -227,6 +227,16 @@ def test_leftovers_of_killed_processes_go(tmp_path: Path, notes: Notes) -> None:
     with open_cache(tmp_path, GIB, notes):
         pass
     assert sorted(path.name for path in tmp_path.iterdir()) == [".tic-vla-edge-cache", "lock"]
+
+
+def test_a_killed_exports_folder_of_stages_goes_and_no_other_does(tmp_path: Path, notes: Notes) -> None:
+    for name in ("killed", "open", "other"):
+        (tmp_path / f".edge-export-{name}").mkdir()
+    with open_cache(tmp_path / ".edge-export-killed", GIB, notes):
+        pass
+    with open_cache(tmp_path / ".edge-export-open", GIB, notes):
+        remove_abandoned(tmp_path, ".edge-export-")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".edge-export-open", ".edge-export-other"]
 
 
 @pytest.mark.parametrize("name", ["photos/a.jpg", "movie.partial", "thesis.building", "notes.txt"])
