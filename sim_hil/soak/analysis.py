@@ -36,8 +36,6 @@ SEGMENT_S: Final = 10.0
 SEGMENT_M: Final = 0.5
 ODOMETRY_HZ: Final = 2.0
 """Rate at which the flight log's odometry is kept, Hz."""
-_WIRE_GAP_NS: Final = 500_000_000
-"""Largest gap between two commands of one run of the bridge; across a longer gap the bridge was not armed."""
 _REPEAT_NS: Final = 20_000_000
 _STOP_REQUEST: Final = "StopMove"
 """The request that stops a Unitree robot; the bridge then waits for the robot before it commands again."""
@@ -125,8 +123,11 @@ class TraceData:
     end: dict[str, Any]
 
 
-def read_trace(path: Path) -> TraceData:
-    """Read a leg's trace; empty if the robot's side never started. Raises OSError."""
+def read_trace(path: Path, begins_ns: Sequence[int] = ()) -> TraceData:
+    """Read a leg's trace; empty if the robot's side never started. Raises OSError.
+
+    `begins_ns`: starts of the runners, each with a new bridge; the time between two bridges is no gap.
+    """
     stamps: list[int] = []
     poses: list[tuple[float, float, float]] = []
     sent: list[int] = []
@@ -153,7 +154,8 @@ def read_trace(path: Path) -> TraceData:
             end = line
     at = np.array(sent, np.int64)
     gaps = np.diff(at)
-    kept = (gaps > _REPEAT_NS / 4) & (gaps < _WIRE_GAP_NS) & ~np.array(stops[:-1], bool)
+    restarted = np.diff(np.searchsorted(np.sort(np.array(begins_ns, np.int64)), at)) > 0
+    kept = (gaps > _REPEAT_NS / 4) & ~restarted & ~np.array(stops[:-1], bool)
     return TraceData(
         np.array(stamps, np.int64),
         np.array(poses, float).reshape(-1, 3),
@@ -245,7 +247,7 @@ def analyse(folder: Path) -> dict[str, Any]:
     about = read_json(folder / LEG)
     events = list(read_lines(folder / EVENTS))
     samples = list(read_lines(folder / SAMPLES))
-    trace = read_trace(folder / TRACE)
+    trace = read_trace(folder / TRACE, [event["t_ns"] for event in events if event["kind"] == "life_begin"])
     runs = sorted(event["run"] for event in events if event["kind"] == "armed")
     read = (read_life(folder / f"flight-{run}.mcap", folder / f"edge-run-{run}.json", run) for run in runs)
     lives = [life for life in read if life is not None]

@@ -9,26 +9,25 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from math import hypot
 from pathlib import Path
 from typing import Any, Final, TextIO
 
-import psutil
-
-from edge.core.cli import EXIT_REFUSED
+from edge.core.cli import EXIT_DONE, EXIT_INTERRUPTED, EXIT_REFUSED
 from edge.core.device import read_device
 from edge.run.say import SayError, say
 from firmware_bridge.system.input_file import read_json
+from sim_hil.processes.process_sampler import ProcessSampler
+from sim_hil.protocols.fault_socket import FaultError
 from sim_hil.realtime.children import StepError
 from sim_hil.realtime.stack import Stack, StackOptions
 from sim_hil.realtime.truth import TruthTail
 from sim_hil.soak.faults import FaultMenu, FaultSchedule, Injector
 from sim_hil.soak.tasks import Journey, SoakTask, TaskRun
-from sim_hil.soak.verdict import SHORTEST_S, WARM_UP_S
+from sim_hil.soak.verdict import FAILED_LEG, SHORTEST_S, WARM_UP_S
 
 SAMPLE_NS: Final = 1_000_000_000
 POLL_S: Final = 0.05
@@ -47,6 +46,8 @@ CONTACT_STOPS: Final = frozenset(
 """Faults that stop a robot after a contact."""
 JUDGED_LIFE_S: Final = WARM_UP_S + SHORTEST_S + 60.0
 """Life of a runner, s, from which its growth can be judged; faults that end it are put off until then."""
+CLEAN: Final = (EXIT_DONE, EXIT_INTERRUPTED)
+"""Exit codes of a process that ended because it was asked to."""
 SAMPLES, EVENTS, LEG = "samples.jsonl", "events.jsonl", "leg.json"
 
 
@@ -128,14 +129,29 @@ class Leg:
                 why = self._lives_of_runners()
             except _StoppedError:
                 why = "stopped"
+            except (StepError, FaultError) as error:
+                self._note("leg_end", why=f"{FAILED_LEG}{str(error).splitlines()[0]}")
+                raise
             self._end_task("cut")
-            if self._stack.runner is not None:
-                code = self._stack.end("runner")
-                self._note("life_end", run=self._stack.runs, code=code, cause="leg", explained="leg")
-            self._stack.end("bridge")
-            self._stack.end("robot")
+            self._end_processes()
             self._note("leg_end", why=why)
         return why
+
+    def _end_processes(self) -> None:
+        """End the leg's processes; one that crashed or did not end when asked counts as a stop."""
+        explanation = self._explanation()
+        for name in ("runner", "bridge", "robot"):
+            if (code := self._stack.end(name)) is None:
+                continue
+            if code not in CLEAN:
+                result = self._stack.result(f"edge-run-{self._stack.runs}")
+                own, raised = _end_of_run(result) if name == "runner" else ("", set())
+                why = own or f"the {name} ended with code {code} at the end of the leg"
+                explained = explained_end(explanation, "", raised, refused=False)
+                self._note("life_end", run=self._stack.runs, code=code, cause=why, explained=explained)
+                self.stops += 1
+            elif name == "runner":
+                self._note("life_end", run=self._stack.runs, code=code, cause="leg", explained="leg")
 
     def _lives_of_runners(self) -> str:
         while True:
@@ -358,43 +374,3 @@ def _append(file: TextIO, content: dict[str, Any]) -> None:
     """Append one JSON line; flushed, so that the file stays complete if the process is killed."""
     file.write(json.dumps(content) + "\n")
     file.flush()
-
-
-PSS_EVERY: Final = 10
-"""Samples between two readings of PSS, which takes milliseconds because the kernel sums it page by page."""
-
-
-class ProcessSampler:
-    """Sampler of processes by name; ended processes are left out."""
-
-    def __init__(self) -> None:
-        self._known: dict[int, psutil.Process] = {}
-        self._count = 0
-
-    def sample(self, pids: Mapping[str, int]) -> dict[str, dict[str, Any]]:
-        """Return by name: pid, cpu_percent since the last sample, rss_bytes, fds, threads, sometimes pss_bytes."""
-        self._count += 1
-        found: dict[str, dict[str, Any]] = {}
-        for name, pid in pids.items():
-            with suppress(psutil.Error):
-                found[name] = self._one(pid)
-        self._known = {pid: process for pid, process in self._known.items() if pid in pids.values()}
-        return found
-
-    def _one(self, pid: int) -> dict[str, Any]:
-        process = self._known.get(pid)
-        if process is None:
-            process = self._known[pid] = psutil.Process(pid)
-            process.cpu_percent()  # the first call only sets the reference
-        with process.oneshot():
-            values: dict[str, Any] = {
-                "pid": pid,
-                "cpu_percent": process.cpu_percent(),
-                "rss_bytes": process.memory_info().rss,
-                "fds": process.num_fds(),
-                "threads": process.num_threads(),
-            }
-        if self._count % PSS_EVERY == 1:
-            with suppress(psutil.Error):
-                values["pss_bytes"] = process.memory_full_info().pss
-        return values

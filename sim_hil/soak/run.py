@@ -27,7 +27,7 @@ from sim_hil.soak.arguments import SHORTEST_LEG_S
 from sim_hil.soak.faults import FaultMenu, SoakInputError
 from sim_hil.soak.leg import LEG, SAMPLES, Leg, LegOptions
 from sim_hil.soak.tasks import Journey
-from sim_hil.soak.verdict import FAIL, PASS, UNDECIDED, BudgetLine, is_lost, judge, measures
+from sim_hil.soak.verdict import FAIL, FAILED_LEG, PASS, UNDECIDED, BudgetLine, is_failed, is_lost, judge, measures
 
 CONFIG: Final = "config.json"
 LEGS: Final = "legs"
@@ -76,8 +76,8 @@ class SoakFolder:
 
     @property
     def elapsed_s(self) -> float:
-        """Total duration of the legs so far, s."""
-        return float(sum(leg["elapsed_s"] for leg in self.legs))
+        """Total duration of the legs so far, s, without those that failed."""
+        return float(sum(leg["elapsed_s"] for leg in self.legs if not is_failed(leg)))
 
     def folder(self, number: int) -> Path:
         """Return the folder of a leg; legs are numbered from 1."""
@@ -195,7 +195,7 @@ def run_legs(
             failed = 0
         except (StepError, FaultError) as error:
             failed += 1
-            why = f"failed: {error}"
+            why = f"{FAILED_LEG}{error}"
             if failed == FAILED_LEGS:
                 raise StepError(f"{FAILED_LEGS} legs in a row failed, the last one: {error}") from error
         log(f"leg {number} ended: {why}; {leg.reached} of {leg.tasks} tasks reached, {leg.stops} stops")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -19,9 +19,21 @@ from sim_hil.soak.trends import BRIDGE_PERIOD_MS, SERIES, jitter_ms, stalls_of, 
 
 DEFAULT_BUDGET: Final = Path(__file__).with_name("budget.toml")
 PASS, FAIL, UNDECIDED = "PASS", "FAIL", "UNDECIDED"
+FAILED_LEG: Final = "failed: "
+"""Beginning of why a leg ended that could not be driven."""
+_WORSE: Final = (PASS, UNDECIDED, FAIL)
 FAULTS_UNANSWERED: Final = "faults_unanswered"
-GROWING: Final = ("stops", FAULTS_UNANSWERED, "log_records_dropped", "memory_slope", "descriptor_slope")
+LEGS_FAILED: Final = "legs_failed"
+GROWING: Final = ("stops", LEGS_FAILED, FAULTS_UNANSWERED, "log_records_dropped", "memory_slope", "descriptor_slope")
 """Beginnings of the names of measures that no later leg can lower."""
+
+
+class Slope(NamedTuple):
+    """Growth per hour with its 95 % interval."""
+
+    per_h: float
+    low: float
+    high: float
 
 
 @dataclass(frozen=True)
@@ -35,11 +47,13 @@ class Measure:
     high: float | None = None
     tagged: str = "measured"
     note: str = ""
+    each: tuple[Slope, ...] = ()
+    """The growth of every life, of which the worst is judged; empty: the measure itself is judged."""
 
     def as_json(self) -> dict[str, Any]:
         """Return the measure as JSON values for the result."""
-        always = ("value", "unit")
-        return {name: value for name, value in self.__dict__.items() if value not in (None, "") or name in always}
+        shown = {name: value for name, value in self.__dict__.items() if name != "each"}
+        return {name: value for name, value in shown.items() if value not in (None, "") or name in ("value", "unit")}
 
 
 @dataclass(frozen=True)
@@ -62,8 +76,12 @@ class BudgetLine:
 def judge(line: BudgetLine, measure: Measure) -> dict[str, Any]:
     """Judge one line and return the JSON values for the result; `why` explains an undecided line.
 
-    A value beyond the limit fails. If its interval includes the limit, it may be noise, so the line is undecided.
+    A value beyond the limit fails. If its interval includes the limit, it may be noise, so the line is undecided. Of
+    several lives, the one with the worst verdict counts.
     """
+    lives = [replace(measure, value=life.per_h, low=life.low, high=life.high, each=()) for life in measure.each]
+    if lives:
+        return max((judge(line, life) for life in lives), key=lambda judged: _WORSE.index(judged["verdict"]))
     if measure.value is None:
         verdict, why = UNDECIDED, measure.note or "not measured"
     else:
@@ -115,14 +133,6 @@ SHORTEST_S: Final = 1800.0
 """Least time after the warm-up for a meaningful slope per hour, s."""
 BLOCK_S: Final = 10.0
 """Length of a block of samples that is reduced to its median, s."""
-
-
-class Slope(NamedTuple):
-    """Growth per hour with its 95 % interval."""
-
-    per_h: float
-    low: float
-    high: float
 
 
 def slope(times_s: Sequence[float], values: Sequence[float]) -> Slope | None:
@@ -193,6 +203,7 @@ def measures(legs: Sequence[Analysis], samples: Sequence[Samples], menu: FaultMe
     found["log_records_dropped"] = Measure(sum(life["dropped"] for life in lives), "", len(lives))
     _tasks(found, [task for leg in legs for task in leg["tasks"] if task["end"] != "cut"])
     _stops(found, legs)
+    found[LEGS_FAILED] = Measure(sum(is_failed(leg) for leg in legs) if legs else None, "", len(legs))
     _faults(found, [fault for leg in legs for fault in leg["faults"]], () if menu is None else menu.faults)
     factors = [leg["real_time_factor"] for leg in legs if leg["real_time_factor"]]
     found["real_time_factor.min"] = Measure(min(factors, default=None), "", len(factors))
@@ -209,7 +220,7 @@ def measures(legs: Sequence[Analysis], samples: Sequence[Samples], menu: FaultMe
 
 
 def _slope(samples: Sequence[Samples], name: str, key: str, scale: float, unit: str) -> Measure:
-    """Return the fastest growth of all sufficiently long lives."""
+    """Return the growth of all sufficiently long lives."""
     lives = [life for leg in samples for life in process_lives(leg, name, key)]
     slopes = [slope([t - times[0] for t in times], [v / scale for v in values]) for times, values in lives]
     found = [one for one in slopes if one is not None]
@@ -217,8 +228,10 @@ def _slope(samples: Sequence[Samples], name: str, key: str, scale: float, unit: 
         least_s = WARM_UP_S + SHORTEST_S
         note = f"no process ran for {least_s:.0f} s, including {WARM_UP_S:.0f} s of warm-up"
         return Measure(None, unit, 0, note=note)
-    per_h, low, high = max(found, key=lambda one: one.low)
-    return Measure(round(per_h, 3), unit, len(found), round(low, 3), round(high, 3), note="the worst life")
+    # The surest growth first: of two lives with one verdict it is shown.
+    each = sorted((Slope(*(round(value, 3) for value in one)) for one in found), key=lambda one: one.low, reverse=True)
+    worst = each[0]
+    return Measure(worst.per_h, unit, len(each), worst.low, worst.high, note="the worst life", each=tuple(each))
 
 
 def _reduced(
@@ -240,6 +253,11 @@ def _tasks(found: dict[str, Measure], tasks: Sequence[Mapping[str, Any]]) -> Non
     found["collision_percent"] = _reduced([100.0 * bool(task["collisions"]) for task in tasks], np.mean, "%")
     found["spl_percent"] = _reduced([task["spl"] for task in tasks], np.mean, "%")
     found["navigation_error_m.mean"] = _reduced([task["ne_m"] for task in tasks], np.mean, "m", 3)
+
+
+def is_failed(leg: Analysis) -> bool:
+    """Return whether a leg could not be driven, so that its time counts as none."""
+    return str(leg["why"]).startswith(FAILED_LEG)
 
 
 def _stops(found: dict[str, Measure], legs: Sequence[Analysis]) -> None:

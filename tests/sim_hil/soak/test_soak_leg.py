@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from edge.run.say import SayError
+from sim_hil.realtime.children import StepError
 from sim_hil.realtime.stack import StackOptions
 from sim_hil.realtime.truth import TruePose, read_lines
 from sim_hil.soak import leg as soak_leg
@@ -84,6 +85,42 @@ def make_leg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> MakeLeg:
         setattr(stack, name, value)
     pose = TruePose(0, 0, 0, 0, ())
     return make
+
+
+@pytest.mark.parametrize(
+    ("codes", "stops"),
+    [
+        ({}, {}),
+        ({"runner": 130, "robot": 130}, {}),
+        ({"runner": -9}, {"the runner ended with code -9 at the end of the leg": ""}),
+        ({"bridge": -11, "robot": 1}, {
+            "the bridge ended with code -11 at the end of the leg": "",
+            "the robot ended with code 1 at the end of the leg": "",
+        }),
+    ],
+)  # fmt: skip
+def test_a_process_that_does_not_end_well_with_its_leg_is_an_unexplained_stop(
+    tmp_path: Path, make_leg: MakeLeg, codes: dict[str, int], stops: dict[str, str]
+) -> None:
+    leg = make_leg(Clock(), 1.0)
+    leg._stack.end = lambda name: codes.get(name, 0)  # type: ignore[method-assign]
+    leg._stack.result = lambda name: tmp_path / name  # type: ignore[method-assign]
+    assert leg.run() == "duration"
+    events = [event for event in read_lines(tmp_path / EVENTS) if event["kind"] == "life_end"]
+    ends = {event["cause"]: event["explained"] for event in events}
+    clean = {} if "runner" in codes and codes["runner"] != 130 else {"leg": "leg"}
+    assert ends == clean | stops and leg.stops == len(stops)
+
+
+def test_a_leg_whose_robot_dies_says_so_in_its_events(tmp_path: Path, make_leg: MakeLeg) -> None:
+    leg = make_leg(Clock(), 60.0)
+    process: Any = SimpleNamespace(running=False, process=SimpleNamespace(returncode=1), log=tmp_path / "hil.log")
+    leg._stack.robot = process
+    with pytest.raises(StepError):
+        leg.run()
+    *_, last = read_lines(tmp_path / EVENTS)
+    assert last["kind"] == "leg_end"
+    assert last["why"].startswith("failed: the robot's side ended with exit code 1")
 
 
 def test_an_instruction_is_sent_again_to_a_runner_too_busy_to_answer(

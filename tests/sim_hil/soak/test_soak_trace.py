@@ -23,6 +23,13 @@ def test_the_wait_for_the_robot_after_a_stop_request_is_no_gap_between_commands(
     assert read_trace(_trace(tmp_path / "t", [("StopMove", first), *moves])).command_gap_ms.tolist() == [20.0, 20.0]
 
 
+def test_a_long_silence_of_the_bridge_is_a_gap_unless_a_new_bridge_was_started_in_it(tmp_path: Path) -> None:
+    first = 1_000_000_000
+    file = _trace(tmp_path / "t", [("Move", first), ("Move", first + 2_000_000_000)])
+    assert read_trace(file, [first - 1]).command_gap_ms.tolist() == [2000.0]
+    assert read_trace(file, [first - 1, first + 1]).command_gap_ms.tolist() == []
+
+
 def test_a_late_stop_request_is_a_gap(tmp_path: Path) -> None:
     first = 1_000_000_000
     commands = [("Move", first), ("StopMove", first + 7 * _PERIOD_NS), ("Move", first + 8 * _PERIOD_NS)]

@@ -21,6 +21,7 @@ from sim_hil.soak.verdict import (
     UNDECIDED,
     BudgetLine,
     Measure,
+    Slope,
     applicable,
     is_lost,
     judge,
@@ -104,7 +105,7 @@ def test_a_soak_without_measurements_is_undecided_with_exit_code_1(
     assert "no data: memory_slope_mib_per_h.edge-run, " in capsys.readouterr().err
     page = write_report(soak, result).read_text(encoding="utf-8")
     assert '<span class="verdict bad">UNDECIDED</span>' in page
-    assert "no verdict: 14 of 14 budget lines are undecided" in page
+    assert "no verdict: 15 of 15 budget lines are undecided" in page
 
 
 def soak_options(folder: Path) -> SoakOptions:
@@ -177,9 +178,43 @@ def test_an_undecided_slope_is_not_lost() -> None:
     assert not is_lost(judge(line, Measure(2.0, "MiB/h", 1, low=0.5, high=3.0)))
 
 
+@pytest.mark.parametrize(
+    ("lives", "verdict"),
+    [
+        ([(0.1, 0.05, 0.2), (2.0, -1.0, 5.0)], UNDECIDED),  # the short life's wide interval is above nobody's low
+        ([(0.1, 0.05, 0.2), (2.0, 1.5, 5.0)], FAIL),
+        ([(0.1, 0.05, 0.2), (0.3, -1.0, 5.0)], PASS),
+        ([(2.0, -1.0, 5.0), (1.5, 1.2, 1.8)], FAIL),
+    ],
+)
+def test_the_life_with_the_worst_verdict_is_judged(lives: list[tuple[float, float, float]], verdict: str) -> None:
+    surest = max(lives, key=lambda life: life[1])
+    found = Measure(surest[0], "MiB/h", 2, *surest[1:], each=tuple(Slope(*life) for life in lives))
+    judged = judge(LIMIT, found)
+    assert judged["verdict"] == verdict
+    assert "each" not in judged["found"] and "each" not in found.as_json()
+
+
+def test_a_leg_that_failed_is_no_time_driven_and_fails_the_budget(tmp_path: Path) -> None:
+    legs = [empty_leg() | {"why": why} for why in ("duration", "failed: the robot's side ended with exit code 1")]
+    assert SoakFolder(tmp_path, legs).elapsed_s == 60.0
+    line = next(line for line in load_budget(DEFAULT_BUDGET) if line.measure == "legs_failed")
+    judged = judge(line, measures(legs, [[], []])["legs_failed"])
+    assert judged["verdict"] == FAIL and is_lost(judged)
+    assert judge(line, measures(legs[:1], [[]])["legs_failed"])["verdict"] == PASS
+    assert judge(line, measures([], [])["legs_failed"])["verdict"] == UNDECIDED
+
+
+@pytest.mark.parametrize("name", ["odometry jumps 1 m", "odometry is NaN", "robot reports an error"])
+def test_what_every_sample_shows_must_be_found_also_while_the_robot_stands(name: str) -> None:
+    silent = {"fault": "odometry-jump", "end_ns": 2, "moved_m": 0.0, "raised_ns": None, "other_ns": None, "name": name}
+    unanswered = measures([empty_leg() | {"faults": [silent]}], [[]], load_menu(DEFAULT_MENU))["faults_unanswered"]
+    assert unanswered.value == 1
+
+
 def empty_leg() -> dict[str, Any]:
     lists = ("lives", "life_ends", "command_gap_ms", "command_ns", "tasks", "drift", "faults", "stalls")
-    nothing = {"real_time_factor": None, "nearest_person": None, "elapsed_s": 60.0, "begin_ns": 0}
+    nothing = {"real_time_factor": None, "nearest_person": None, "elapsed_s": 60.0, "begin_ns": 0, "why": "duration"}
     return {**{key: [] for key in lists}, **nothing}
 
 
