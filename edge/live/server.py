@@ -33,6 +33,7 @@ from edge.flightlog.schemas import ANY_OBJECT, SCHEMAS
 from edge.flightlog.standard_messages import StandardMessages
 from edge.flightlog.standard_schemas import COMPRESSED_IMAGE, STANDARD_SCHEMAS, Schema
 from edge.live import wire
+from edge.live.connections import AddressError, Strangers, accept, listen
 from edge.live.foxglove import MOST_REQUEST_BYTES, SUBPROTOCOLS, Channels, ProtocolError, Subscriptions, server_info
 from edge.live.metrics import CONTENT_TYPE, Metrics
 from edge.live.stop import RobotStop
@@ -50,7 +51,8 @@ _SCHEMA_OF: Final = {**STANDARD_SCHEMAS, **SCHEMAS}
 _LAST_MESSAGES_S: Final = 0.5
 """Time to send what waits when the runner has ended, s; the connections have as much again to end."""
 _MOST_WAITING: Final = 64
-_MOST_FILES: Final = 128  # also the most connections: a flood fills them, not the memory
+_MOST_FILES: Final = 128
+"""Most open files, and so connections: a flood fills them, not the memory; strangers have half of them at most."""
 _NICENESS: Final = 10
 _HEARTBEAT_S: Final = 10.0
 _PAGE_HEADERS: Final = {
@@ -115,6 +117,8 @@ class LiveServer:
         """Stamp of the `/run` record: the page finds in it which run an answer to STOP belongs to."""
         self._malformed = 0
         self._dropped = 0  # by the runner
+        self.strangers = Strangers()
+        """Connections that have not shown the token."""
 
     def app(self) -> web.Application:
         """Return the web application."""
@@ -200,6 +204,8 @@ class LiveServer:
             given = request.query.get("token", "")
         if not hmac.compare_digest(given.encode(errors="replace"), self._config.token.encode()):
             raise web.HTTPForbidden(text="the token is missing or wrong: use the address that the command printed\n")
+        if request.protocol is not None:
+            self.strangers.admit(request.protocol)
         origin = request.headers.get("Origin")
         own = f"{request.scheme}://{request.host}"
         if origin is not None and origin not in (own, *origins):
@@ -309,20 +315,21 @@ async def serve(runner: socket.socket) -> None:
     serving = web.AppRunner(server.app(), access_log=None, keepalive_timeout=15.0, shutdown_timeout=_LAST_MESSAGES_S)
     await serving.setup()
     try:
-        site = web.TCPSite(serving, config.address, config.port, backlog=MOST_CLIENTS)
-        await site.start()
-    except OSError as error:
-        where, reason = f"{config.address}:{config.port}", os.strerror(error.errno or 0)
-        why = f"--live: cannot listen at {where} ({reason}); choose another port"
-        runner.send(wire.Datagram(wire.REFUSED, why.encode()).encode())
+        listening = await listen(config.address, config.port)
+    except AddressError as error:
+        runner.send(wire.Datagram(wire.REFUSED, f"--live: {error}".encode()).encode())
         await serving.cleanup()
         return
+    assert serving.server is not None
+    accepting = [asyncio.create_task(accept(each, serving.server, server.strangers)) for each in listening]
     freeze_garbage()
-    port = serving.addresses[0][1]
+    port = listening[0].getsockname()[1]
     runner.send(wire.Datagram(wire.LISTENING, str(port).encode()).encode())
     while data := await _received(runner):
         server.take(data)
-    await site.stop()  # at once: the next run may listen at this port
+    for task, each in zip(accepting, listening, strict=True):  # at once: the next run may listen at this port
+        task.cancel()
+        each.close()
     await server.finish()
     await serving.cleanup()
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import socket
 import time
 from collections.abc import Awaitable, Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -16,6 +18,7 @@ import psutil
 import pytest
 
 from edge.flightlog.recorder import Recorder
+from edge.live.connections import STRANGER_S
 from edge.live.feed import LiveFeed
 from edge.live.options import LiveError, LiveOptions
 
@@ -171,6 +174,44 @@ def test_slow_and_silent_clients_cost_the_others_nothing(view: View) -> None:
     assert grown < 24 * 2**20
 
 
+def test_connections_without_the_token_do_not_keep_a_stop_away(capfd: pytest.CaptureFixture[str], view: View) -> None:
+    """More silent connections than the view may open files, as any computer of the network can make."""
+    host = urlsplit(view.base)
+    headers = {"Authorization": f"Bearer {view.token}"}
+
+    async def stop(session: aiohttp.ClientSession) -> bool:
+        request = asyncio.create_task(session.post(f"{view.base}/stop", headers=headers))
+        while not request.done():
+            view.feed.poll()
+            await asyncio.sleep(0.02)
+        return bool((await (await request).json())["stopped"])
+
+    silent = [socket.create_connection((host.hostname, host.port), 5) for _ in range(200)]
+    try:
+        assert view.run(stop) is True and len(view.stops) == 1
+        ended_s = STRANGER_S + 5.0
+        for each in silent:
+            each.settimeout(ended_s)
+            with suppress(ConnectionResetError):
+                assert each.recv(1) == b""
+    finally:
+        for each in silent:
+            each.close()
+    assert capfd.readouterr().err == ""  # asyncio's own server wrote a traceback for each that it could not accept
+
+
+def test_a_connection_that_has_shown_the_token_stays(view: View) -> None:
+    async def watch(session: aiohttp.ClientSession) -> int:
+        async with session.ws_connect(f"{view.base}/view?token={view.token}") as channel:
+            await asyncio.sleep(STRANGER_S + 0.5)
+            view.put(7)
+            while (message := await channel.receive(10)).type is not aiohttp.WSMsgType.TEXT:
+                pass
+        return int(json.loads(message.data)["record"]["tick"])
+
+    assert view.run(watch) == 7
+
+
 @pytest.mark.slow
 def test_records_for_a_frozen_view_are_dropped_and_nobody_waits(view: View) -> None:
     view.process.suspend()
@@ -274,8 +315,31 @@ def test_malformed_frames_end_their_own_connection_only(view: View) -> None:
 
 
 def test_a_port_in_use_is_one_line(view: View, tmp_path: Path) -> None:
-    with pytest.raises(LiveError, match=r"^--live: cannot listen at 127\.0\.0\.1:\d+ \(Address already in use\)"):
+    line = r"^--live: cannot listen at 127\.0\.0\.1:\d+ \(Address already in use\); choose another port$"
+    with pytest.raises(LiveError, match=line):
         LiveFeed(LiveOptions(port=view.feed.port), tmp_path / "b.sock", lambda: True, view.lines.append)
+
+
+@pytest.mark.parametrize(
+    ("address", "reason"),
+    [
+        ("192.0.2.1", "Cannot assign requested address"),
+        ("no-such-computer.invalid", "Name or service not known|Temporary failure in name resolution"),
+        ("a..b", "not the name of a computer"),
+    ],
+)
+def test_an_address_of_another_computer_is_one_line(tmp_path: Path, address: str, reason: str) -> None:
+    line = rf"^--live: cannot listen at {re.escape(address)}:0 \(({reason})\); choose another --live-address"
+    with pytest.raises(LiveError, match=line):
+        LiveFeed(LiveOptions(address, port=0), tmp_path / "b.sock", lambda: True, lambda _: None)
+
+
+def test_a_name_of_this_computer_is_served_at_its_loopback(tmp_path: Path) -> None:
+    feed = LiveFeed(LiveOptions("localhost", port=0), tmp_path / "b.sock", lambda: True, lambda _: None)
+    try:
+        socket.create_connection(("127.0.0.1", feed.port), 5).close()
+    finally:
+        feed.close()
 
 
 def test_the_process_ends_with_the_runner(view: View) -> None:
