@@ -178,7 +178,7 @@ class DriftEstimator:
             velocity = (0.0, 0.0, 0.0)
         else:
             vx = report.vx_mps / (1.0 + model.scale)
-            vy = report.vy_mps / model.scale_y - model.sideways * vx
+            vy = (report.vy_mps - model.sideways * vx) / model.scale_y
             rate = report.gyro_wz_radps
             velocity = (vx, vy, report.wz_radps if rate is None else rate - self.gyro_bias_radps)
         return StampedPose(node.stamp_ns, node.pose, *velocity, report.roll_rad, report.pitch_rad)

@@ -158,7 +158,7 @@ class OdometryModel:
         if increment.still:
             return 0.0, 0.0, 0.0, 0.0
         forward = increment.dx_m / (1.0 + self.scale)
-        left = increment.dy_m / self.scale_y - self.sideways * forward
+        left = (increment.dy_m - self.sideways * forward) / self.scale_y
         if self.has_gyro:
             return forward, left, increment.turn_rad - self.heading * increment.dt_s, increment.dt_s
         distance = math.hypot(forward, left)
@@ -229,7 +229,7 @@ def integrate(increments: list[Increment], model: OdometryModel) -> Interval:
         distance += math.hypot(forward, left)
         gains[:2, HEADING] += (-dy * turned, dx * turned)
         gains[:2, SCALE] += (c * forward, s * forward)
-        gains[:2, SIDEWAYS] += (-s * forward, c * forward)
+        gains[:2, SIDEWAYS] += (-s * forward / model.scale_y, c * forward / model.scale_y)
         turned += gain
     gains[2, HEADING] = turned
     variance_m2 = model.rate_m_per_m**2 * grown(distance) + 1e-8

@@ -149,7 +149,7 @@ def test_without_camera_and_truth_there_is_nothing_to_compare_with(tmp_path: Pat
 def test_a_trace_of_another_time_is_named(tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
     log = write_log(tmp_path / "d.mcap", drive(5))
     trace = tmp_path / "t.jsonl"
-    trace.write_text('{"t_ns": 900000000000000, "kind": "pose", "x": 0, "y": 0, "theta": 0}\n')
+    trace.write_text('{"t_ns": 900000000000000, "kind": "pose", "x": 0, "y": 0, "theta": 0}\n{"t_ns": 9')
     assert main(["odometry", str(log), "--truth", str(trace)]) == 2
     assert "same monotonic clock" in capsys.readouterr().err
 
@@ -173,7 +173,7 @@ def test_a_truth_that_cannot_be_read_is_one_clear_line(
     if content is None:
         os.mkfifo(trace)
     else:
-        trace.write_bytes(content)
+        trace.write_bytes(content + b"\n")
     assert main(["odometry", str(log), "--truth", str(trace)]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from hypothesis import strategies as st
 
 from edge.core.geometry import SE2
 from edge.odometry import pose_chain
-from edge.odometry.pose_chain import HEADING, PARAMETERS, SCALE, Node
+from edge.odometry.gate import Increment
+from edge.odometry.pose_chain import HEADING, PARAMETERS, SCALE, SIDEWAYS, Node, OdometryModel, integrate
 
 NONE = np.zeros((PARAMETERS, PARAMETERS))
 STEP_NS = 10_000_000
@@ -85,6 +87,28 @@ def test_an_interval_counts_like_the_increments_that_it_is_made_of() -> None:
     )
     assert whole.pose.as_tuple() == pytest.approx(small[100].pose.as_tuple())
     assert whole.white == pytest.approx(small[100].white, abs=1e-12)
+
+
+@given(*(st.floats(-0.1, 0.1) for _ in range(2)), st.floats(0.9, 1.1), st.floats(0.7, 1.4), st.floats(-0.3, 0.3))
+def test_a_report_made_as_the_calibration_says_is_undone(
+    x: float, y: float, scale_x: float, scale_y: float, sideways: float
+) -> None:
+    """Reported are the scaled motions, and to the left also `sideways` per metre forward."""
+    model = OdometryModel(True, 0.0, scale_x - 1, sideways, scale_y, 1.0, 0.0, 0.0, 0.0, 0.0)
+    reported = Increment(STEP_NS, 0.01, scale_x * x, scale_y * y + sideways * x, 0.0, 0.0)
+    assert model.corrected(reported)[:2] == pytest.approx((x, y), abs=1e-12)
+
+
+@pytest.mark.parametrize("which", [HEADING, SCALE, SIDEWAYS])
+def test_the_derivatives_of_an_interval_are_those_of_its_motion(which: int) -> None:
+    """`gains` is the error that the parameter's error causes, so the motion's derivative with its sign changed."""
+    name, step = {HEADING: "heading", SCALE: "scale", SIDEWAYS: "sideways"}[which], 1e-6
+    model = OdometryModel(True, 0.02, 0.0, 0.0, 1.3, 1.0, 0.0, 0.0, 0.0, 0.0)
+    increments = [Increment((n + 1) * STEP_NS, 0.01, 0.008, 0.001, 0.004, 0.004) for n in range(100)]
+    before, after = (
+        integrate(increments, replace(model, **{name: getattr(model, name) + sign * step})).motion for sign in (-1, 1)
+    )
+    assert integrate(increments, model).gains[:, which] == pytest.approx(-(after - before) / (2 * step), rel=0.02)
 
 
 def test_before_its_beginning_the_chain_knows_nothing() -> None:
