@@ -7,7 +7,7 @@ import json
 import platform
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -129,8 +129,13 @@ def versions() -> dict[str, str]:
     return found
 
 
-def bench_result(run: BenchRun, store: ResultStore, *, finished: bool, started_ns: int) -> dict[str, Any]:
-    """Return the result for `--json`."""
+def bench_result(
+    run: BenchRun, store: ResultStore, *, finished: bool, started_ns: int, before: Collection[str] = ()
+) -> dict[str, Any]:
+    """Return the result for `--json`; `before`: ids of episodes that an earlier session of the run has finished.
+
+    `wall_s` and `simulated_s` are of this session alone.
+    """
     results = sorted(store.results, key=lambda result: result.id)
     wall_s = (time.monotonic_ns() - started_ns) / 1e9
     causes, failed = read_causes(store.directory, results), any(not each.success or each.collided for each in results)
@@ -153,7 +158,7 @@ def bench_result(run: BenchRun, store: ResultStore, *, finished: bool, started_n
         "versions": store.config["versions"],
         "code_changed": store.config["versions"]["code"] != code_sha256(),
         "wall_s": round(wall_s, 1),
-        "simulated_s": round(sum(result.time_s for result in results), 1),
+        "simulated_s": round(sum(result.time_s for result in results if result.id not in before), 1),
         "tagged": "measured",
     }
 
@@ -209,15 +214,15 @@ def execute(
     store: ResultStore | None = None
     try:
         store = (ResultStore.resume if resume else ResultStore.create)(directory, run.config())
-        before = len(store.results)
+        before = {result.id for result in store.results}
         tasks = run.tasks(store.directory, video, flights, live)
         finished = run_all(tasks, backend, store, stopped=stopped, watcher=watcher)
     finally:
         backend.close()
         if store is not None:
             store.close()
-    result = bench_result(run, store, finished=finished, started_ns=started_ns)
-    return Execution(store, finished, result, len(store.results) - before)
+    result = bench_result(run, store, finished=finished, started_ns=started_ns, before=before)
+    return Execution(store, finished, result, len(store.results) - len(before))
 
 
 class RunsError(RuntimeError):
@@ -245,13 +250,22 @@ def run_episodes(
     resume = (out / CONFIG).is_file()
     execution = execute(run, out, LocalJobs(jobs), resume=resume, stopped=stopped, watcher=watcher)
     store, finished = execution.store, execution.finished
-    if execution.added or not (out / RESULT).is_file():
+    if execution.added or not _is_current(out / RESULT, len(store.results)):
         write_whole(out / RESULT, json.dumps(execution.result, indent=1) + "\n")
     if not finished:
         raise KeyboardInterrupt
     if store.failed:
         raise RunsError(f"{out}: {len(store.failed)} episodes have no result, the first: {store.failed[0].why}")
     return sorted(store.results, key=lambda each: each.id)
+
+
+def _is_current(path: Path, episodes: int) -> bool:
+    """Return whether a result is that of a finished run with so many episodes: a kill can come before it is written."""
+    try:
+        content = read_json(path)
+        return content["summary"]["finished"] is True and len(content["episodes"]) == episodes
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
 
 
 def read_result(out: Path) -> dict[str, Any]:

@@ -116,10 +116,14 @@ def test_a_run_of_the_first_few_episodes_can_be_extended(suite: Path, two_jobs: 
     out = tmp_path / "out"
     arguments = ["--suite", str(suite), "--policy", "random", "--drift", "severe", "--out", str(out)]
     assert cli.main([*arguments, "--first", "1"]) == 0
-    summary = json.loads((out / "result.json").read_text())["summary"]
-    assert (summary["asked"], summary["finished"], len(hashes(out))) == (1, True, 1)
+    first = json.loads((out / "result.json").read_text())
+    assert (first["summary"]["asked"], first["summary"]["finished"], len(hashes(out))) == (1, True, 1)
+    assert "1 of 1 episodes finished" in (out / "report.html").read_text()
     assert cli.main([*arguments, "--resume"]) == 0
     assert hashes(out) == hashes(two_jobs)
+    both = json.loads((out / "result.json").read_text())
+    # As its wall time, what was simulated is that of the second session.
+    assert both["simulated_s"] == pytest.approx(sum(r["time_s"] for r in both["episodes"]) - first["simulated_s"])
 
 
 @pytest.mark.slow

@@ -67,7 +67,7 @@ def write_report(store: ResultStore, summary: Mapping[str, object], title: str) 
         conditions=conditions.describe(),
         suite=store.config["suite"],
         finished=len(results),
-        requested=len(store.config["episodes"]),
+        requested=max(len(results), int(str(summary.get("asked", len(store.config["episodes"]))))),
         untrained=not store.config.get("trained", True),
         tiles=_headline(summary),
         failed=Table(("episode", "attempts", "why"), failed, numeric=frozenset({1})),

@@ -50,8 +50,9 @@ class ResultStore:
     def create(directory: Path, config: Mapping[str, object]) -> ResultStore:
         """Create a run in a new or empty directory. Raises StoreError."""
         check_new(directory)
-        _make(directory)
+        _make(directory, ())  # what a kill leaves before the configuration is an empty directory, which is new again
         write_whole(directory / CONFIG, json.dumps(config, indent=1) + "\n")
+        _make(directory)
         return ResultStore(directory, config, (), _locked(directory))
 
     @staticmethod
@@ -173,9 +174,9 @@ def _locked(directory: Path) -> IO[bytes]:
     return file
 
 
-def _make(directory: Path) -> None:
+def _make(directory: Path, folders: Sequence[str] = (EPISODES, VIDEOS)) -> None:
     try:
-        for folder in (EPISODES, VIDEOS):
+        for folder in (".", *folders):
             (directory / folder).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StoreError(f"--out {directory}: cannot be created ({error.strerror})") from error

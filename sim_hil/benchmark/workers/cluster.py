@@ -20,7 +20,7 @@ from typing import Any
 
 from edge.core.cli import EXIT_BAD_INPUT
 from sim_hil.benchmark.results.record import EpisodeResult
-from sim_hil.benchmark.results.store import CAUSES, EPISODES, VIDEOS
+from sim_hil.benchmark.results.store import CAUSES, EPISODES, FLIGHTS, VIDEOS
 from sim_hil.benchmark.workers.code_version import code_sha256
 from sim_hil.benchmark.workers.jobs import WORKER, Ended, LocalJobs
 from sim_hil.benchmark.workers.task import EpisodeTask
@@ -164,11 +164,11 @@ def run_on_node(task_json: str, code: str, worker: Sequence[str] | None) -> tupl
         why = f"{host} has other code than the machine that started the run: install the same version on every node"
         return json.dumps({"result": None, "why": why, "refused_code": EXIT_BAD_INPUT, "host": host}), []
     with tempfile.TemporaryDirectory(prefix="edge-bench-") as folder:
-        for name in (EPISODES, VIDEOS, CAUSES):
+        for name in (EPISODES, VIDEOS, FLIGHTS, CAUSES):
             (Path(folder) / name).mkdir()
         task = replace(EpisodeTask.of_json(json.loads(task_json)), folder=Path(folder))
         ended = _one(task, worker)
-        found = [path for path in sorted(Path(folder).rglob("*")) if path.suffix in (".json", ".mp4")]
+        found = [path for path in sorted(Path(folder).rglob("*")) if path.suffix in (".json", ".mp4", ".mcap")]
         files = [(path.relative_to(folder).as_posix(), path.read_bytes()) for path in found]
     outcome = {
         "result": None if ended.result is None else ended.result.as_json(),

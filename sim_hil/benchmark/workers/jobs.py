@@ -131,7 +131,9 @@ def _take(
         raise RefusedRunError(f"episode {ended.id}: {ended.why}", ended.refused_code)
     if ended.result is not None:
         for name, data in ended.files:
-            write_whole(store.directory / name, data)
+            path = store.directory / name
+            path.parent.mkdir(exist_ok=True)
+            write_whole(path, data)
         if store.add(ended.result):
             watcher.finished(ended.result)
     elif task.attempt < backend.attempts:

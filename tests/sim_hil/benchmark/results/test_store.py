@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from sim_hil.benchmark.results import compare
+from sim_hil.benchmark.results import store as store_module
 from sim_hil.benchmark.results.record import DELAY_POINTS, FailedRun, ResultError
 from sim_hil.benchmark.results.store import FAILED, RESULTS, ResultStore, StoreError, read_failed, read_results
 from tests.support.benchmark import dynanav_fakes as fakes
@@ -59,6 +60,18 @@ def test_a_directory_with_files_is_not_written_into(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("precious")
     with pytest.raises(StoreError, match="new or empty directory"):
         ResultStore.create(tmp_path, CONFIG)
+
+
+def test_a_run_that_died_before_its_configuration_was_written_is_begun_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(store_module, "write_whole", killed)
+        made(tmp_path)
+    assert made(tmp_path).results == []
 
 
 def test_resuming_where_no_run_is_is_refused(tmp_path: Path) -> None:

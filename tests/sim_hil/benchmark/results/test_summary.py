@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim_hil.benchmark import cli
+from sim_hil.benchmark import cli, runs
 from sim_hil.benchmark.results.bootstrap import mean_ci95, paired_ci95
 from sim_hil.benchmark.results.record import FailedRun, ResultError
 from sim_hil.benchmark.results.store import ResultStore
@@ -34,6 +34,22 @@ def test_every_group_has_the_same_numbers() -> None:
     assert set(summary["by_scene"]) == {"corridor", "office"} and set(summary["by_robot"]) == {"go2", "carter"}
     assert list(summary["by_crowd"]) == ["0", "21-40"]
     assert summary["by_scene"]["office"]["sr"] == 100 and summary["by_scene"]["office"]["sr_ci95"] is None
+
+
+@pytest.mark.parametrize(
+    ("content", "current"),
+    [
+        ('{"summary": {"finished": true}, "episodes": [{}, {}]}', True),
+        ('{"summary": {"finished": false}, "episodes": [{}, {}]}', False),
+        ('{"summary": {"finished": true}, "episodes": [{}]}', False),
+        ('{"summary": {"fin', False),
+        ("[]", False),
+    ],
+)
+def test_a_result_of_an_unfinished_run_is_written_again(tmp_path: Path, content: str, current: bool) -> None:
+    (tmp_path / "result.json").write_text(content)
+    assert runs._is_current(tmp_path / "result.json", 2) is current
+    assert not runs._is_current(tmp_path / "missing.json", 2)
 
 
 @pytest.mark.slow

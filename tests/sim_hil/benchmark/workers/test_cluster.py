@@ -16,8 +16,11 @@ from pathlib import Path
 import pytest
 
 from sim_hil.benchmark.results.store import ResultStore, read_results
+from sim_hil.benchmark.workers import cluster
 from sim_hil.benchmark.workers.cluster import ClusterError, ClusterJobs, run_on_node
-from sim_hil.benchmark.workers.jobs import POLL_S, RunWatcher, run_all
+from sim_hil.benchmark.workers.code_version import code_sha256
+from sim_hil.benchmark.workers.jobs import POLL_S, Ended, RunWatcher, run_all
+from sim_hil.benchmark.workers.task import EpisodeTask
 from tests.support.benchmark import dynanav_fakes as fakes
 from tests.support.processes import REPOSITORY
 
@@ -153,6 +156,18 @@ def test_a_cluster_whose_processors_come_back_is_not_given_up(bare: NoProcessors
     bare.processors = 0
     bare.sleep(59)
     assert jobs.wait(0.2) == () and jobs.free() == 0
+
+
+@pytest.mark.slow
+def test_a_node_sends_back_flight_logs_and_causes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def one(task: EpisodeTask, _: object) -> Ended:
+        task.flight_path.write_bytes(b"log")
+        (task.folder / "causes" / "a.json").write_bytes(b"{}")
+        return Ended("a", fakes.result("a"))
+
+    monkeypatch.setattr(cluster, "_one", one)
+    _, files = run_on_node(json.dumps(fakes.task("a", tmp_path).as_json()), code_sha256(), None)
+    assert dict(files) == {"flights/a.mcap": b"log", "causes/a.json": b"{}"}
 
 
 @pytest.mark.slow

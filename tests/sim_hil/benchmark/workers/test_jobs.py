@@ -43,7 +43,8 @@ class Scripted:
             return [Ended(name, fakes.result(name))] * 2
         if end == "dies":
             return [Ended(name, why="died")]
-        return [Ended(name, fakes.result(name, attempts=task.attempt))]
+        files = ((f"causes/{name}.json", b"{}"), (f"flights/{name}.mcap", b"log")) if end == "files" else ()
+        return [Ended(name, fakes.result(name, attempts=task.attempt), files=files)]
 
     def times_s(self) -> dict[str, float]:
         return {}
@@ -65,6 +66,13 @@ def test_every_episode_gets_one_result_and_no_more_run_at_a_time_than_there_are_
     assert run_all(tasks_in(store, "a", "b", "c", "d", "e"), backend, store)
     assert sorted(r.id for r in read_results(store.directory)) == ["a", "b", "c", "d", "e"]
     assert backend.most == 2 and backend.closed
+
+
+def test_what_another_node_has_written_is_put_into_folders_that_the_run_lacks(tmp_path: Path) -> None:
+    store = store_in(tmp_path)
+    assert run_all(tasks_in(store, "a"), Scripted(1, a=["files"]), store, stopped=lambda: False)
+    assert (store.directory / "causes/a.json").read_bytes() == b"{}"
+    assert (store.directory / "flights/a.mcap").read_bytes() == b"log"
 
 
 def test_an_attempt_that_ends_without_a_result_is_run_again_once(tmp_path: Path) -> None:
