@@ -38,7 +38,7 @@ from tools.train.pipeline.model_card import ship, write_card
 from tools.train.run.curves import draw_curves
 from tools.train.run.distributed import SINGLE, Ranks, computes_bf16, leave, ranks_of_environment
 from tools.train.run.job import StageFailedError, StageJob, StopFlag, progress_for
-from tools.train.run.network_file import START, ExportError, import_start
+from tools.train.run.network_file import ExportError
 from tools.train.run.run_dir import RunDir, take_drives
 
 PACKAGES: Final = ("calib.", "edge.", "export.", "sim_hil.", "tools.")
@@ -188,10 +188,8 @@ def _take_given(args: argparse.Namespace, recipe: Recipe, before: Sequence[Step]
         run_dir.borrow(RunDir(args.base), BORROWED, recipe)
     if args.drives is not None:
         take_drives(run_dir, args.drives)
-    if args.checkpoint and not run_dir.begun(START):
-        import_start(run_dir.out, recipe.model, args.checkpoint, recipe.seed)
-        if before:
-            chain.adopt(run_dir, before)
+    if args.checkpoint:
+        chain.take_start(run_dir, recipe, args.checkpoint, before)
 
 
 def _step(

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.artifacts.files import ArtifactError
+from edge.core.cli import describe_os_error
 from edge.reasoning.prompt import InstructionError
 from export.core.typed import build
 from sim_hil.benchmark.env.observation import Observation
@@ -154,6 +155,9 @@ def _of_layout(order: Order, numbers: range, size: int) -> Iterator[Mapping[str,
                 yield {"dropped": drive_id, "why": "its instruction is too long for the model"}
             except ArtifactError as error:
                 yield {"refused": str(error)}
+                return
+            except OSError as error:  # such as a full disk: the drives left out now would be left out for good
+                yield {"refused": describe_os_error(error, str(order.folder))}
                 return
 
 

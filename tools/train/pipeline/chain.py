@@ -25,8 +25,16 @@ from tools.train.pipeline import evaluate
 from tools.train.rl import rl
 from tools.train.run.distributed import computes_bf16
 from tools.train.run.job import StageJob
-from tools.train.run.network_file import ORDER, START, export_artifacts, stage_weights, weights_before
-from tools.train.run.run_dir import RunDir
+from tools.train.run.network_file import (
+    ORDER,
+    START,
+    export_artifacts,
+    import_start,
+    stage_weights,
+    started_with,
+    weights_before,
+)
+from tools.train.run.run_dir import RunDir, read_record
 from tools.train.sft import sft
 
 DISTRIBUTED: Final = ("encoder", "sft", "imitate")
@@ -111,6 +119,35 @@ def steps_until(name: str, recipe: Recipe, wanted: Sequence[Step]) -> list[Step]
     if not recipe.dagger.newest_only and any(step.stage == "dagger" and step not in before for step in wanted):
         raise TrainError(f"--after {name}: the run has no drives from before it; set dagger.newest_only=true")
     return before
+
+
+def take_start(run_dir: RunDir, recipe: Recipe, checkpoints: Sequence[Path], before: Sequence[Step]) -> None:
+    """Take given weights as the run's first, and as the result of the steps `before`; again after an interruption.
+
+    Raises CheckpointError, or TrainError for a run that was started otherwise: it would go on without these weights.
+    """
+    advice = "name another --out, or leave the option out to continue that run"
+    own = next((stage for stage in ORDER[1:] if run_dir.begun(stage)), None)
+    if not stage_weights(run_dir.out, START).is_file():
+        if own is not None:
+            raise TrainError(f"--checkpoint: {run_dir.out} was started without it (it has the stage {own}); {advice}")
+        import_start(run_dir.out, recipe.model, checkpoints, recipe.seed)
+    elif not started_with(run_dir.out, checkpoints):
+        raise TrainError(f"--checkpoint {checkpoints[0]}: {run_dir.out} was started with other weights; {advice}")
+    if not before:
+        return
+    after = _adopted_after(run_dir)
+    if after not in (None, before[-1].name) or (after is None and own is not None):
+        began = "without --after" if after is None else f"with --after {after}"
+        raise TrainError(f"--after {before[-1].name}: {run_dir.out} was started {began}; {advice}")
+    if after is None or not run_dir.model_path.is_file():  # the copy there is the last thing that `adopt` makes
+        adopt(run_dir, before)
+
+
+def _adopted_after(run_dir: RunDir) -> str | None:
+    """Return the step whose result the start weights were taken for; None if they were taken for none."""
+    results = (read_record(path) for path in sorted(run_dir.out.glob("*/result.json")))
+    return next((str(result["after"]) for result in results if ADOPTED in result), None)
 
 
 def adopt(run_dir: RunDir, steps: Sequence[Step]) -> None:

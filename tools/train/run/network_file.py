@@ -16,6 +16,7 @@ from safetensors import SafetensorError, safe_open
 from edge.artifacts.files import MANIFEST_NAME
 from edge.core.cli import EXIT_DONE, EXIT_INTERRUPTED, write_whole
 from export.checkpoint.load import load_checkpoint
+from export.checkpoint.sources import open_source
 from export.core.tensor_file import replacing
 from export.model.config import PRESETS, ActionConfig, ModelConfigError, TicVlaConfig, config_from_dict
 from export.model.network import PARTS, TicVla, build
@@ -62,6 +63,21 @@ def import_start(out: Path, config: TicVlaConfig, checkpoints: Sequence[Path], s
     if len(checkpoints) == 1 and (card := card_of(checkpoints[0])) is not None:
         path.with_name(START_CARD).write_text(card, encoding="utf-8")
     return path
+
+
+def started_with(out: Path, checkpoints: Sequence[Path]) -> bool:
+    """Return whether a run's start weights were made of these files, whose hashes their origin contains.
+
+    Raises CheckpointError, or TrainError for damaged start weights.
+    """
+    path = stage_weights(out, START)
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            origin = (file.metadata() or {}).get("origin", "")
+    except (OSError, SafetensorError) as error:
+        raise TrainError(f"{path}: not weights of edge-train ({error})") from error
+    files = [file for given in checkpoints for file in open_source(given).files.values()]
+    return all(f"(sha256 {file_sha256(file)}" in origin for file in files)
 
 
 def _as_written(checkpoints: Sequence[Path], config: TicVlaConfig) -> TicVlaConfig:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import shutil
 import sys
 from collections import Counter
@@ -18,7 +20,7 @@ from export.model.config import PRESETS
 from sim_hil.benchmark.language.instructions import is_held_out
 from sim_hil.benchmark.policies.select import robot_config
 from tests.support.train.train_fake_worker import BEGUN
-from tools.train.collect import collection
+from tools.train.collect import collection, worker
 from tools.train.collect.collection import Collection, collect, fill
 from tools.train.collect.worker import Draw, Order, messages
 from tools.train.config.checks import TrainError
@@ -212,6 +214,16 @@ def test_a_real_drive_is_made_of_a_training_scenario_and_is_the_same_in_any_proc
     assert drive.about.kind == "corridor" and drive.about.outcome == "reached" and drive.about.driver == "expert"
     assert len(drive.wordings) >= 8 and not any(is_held_out(text) for text in drive.wordings)
     assert len(drive.traces) == (len(drive) - 1) // 10 + 1
+
+
+def test_a_full_disk_ends_the_recording_and_drops_no_drive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(worker, "_drive", full)
+    order = Order(str(tmp_path), "e", 7, 3, 0, 2, (), CollectConfig(episodes=2, kinds={"corridor": 1.0}))
+    *_, last = messages(plain(order))
+    assert last == {"refused": f"{tmp_path}: No space left on device"}
 
 
 @pytest.mark.slow

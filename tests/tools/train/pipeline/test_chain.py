@@ -24,7 +24,7 @@ from tools.train.config.collect import DaggerConfig
 from tools.train.config.recipe import Recipe, load_recipe
 from tools.train.imitate.data import Delays
 from tools.train.pipeline import chain
-from tools.train.pipeline.chain import Step, adopt, is_done, may_begin, run_step, steps_of, steps_until
+from tools.train.pipeline.chain import Step, adopt, is_done, may_begin, run_step, steps_of, steps_until, take_start
 from tools.train.pipeline.model_card import card, ship, write_card
 from tools.train.run.job import StageFailedError, StageJob
 from tools.train.run.network_file import (
@@ -174,6 +174,62 @@ def test_a_run_goes_on_from_the_weights_that_a_round_left_elsewhere(
     use(monkeypatch, stage_that("after"))
     run_step(job(run_dir), Step("imitate", 2))
     assert (run_dir.out / "imitate-1" / "model.safetensors").exists() and run_dir.retired("imitate") == 2
+
+
+@pytest.fixture
+def given(tmp_path: Path) -> Path:
+    """Weights of somebody."""
+    path = tmp_path / "w.safetensors"
+    save_weights(build(TINY.model, 7), path, WeightsInfo(True, "elsewhere"))
+    return path
+
+
+AFTER = steps_until("imitate-1", NEWEST, steps_of("all", NEWEST))
+
+
+def test_given_weights_may_be_named_again_when_a_run_continues(run_dir: RunDir, given: Path) -> None:
+    for _ in range(2):
+        take_start(run_dir, NEWEST, [given], AFTER)
+    assert (run_dir.retired("sft"), run_dir.retired("imitate")) == (1, 1)
+
+
+def test_an_interrupted_adoption_is_finished(run_dir: RunDir, given: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    finish, count = RunDir.finish, 0
+
+    def interrupted(self: RunDir, stage: str, result: Any) -> None:
+        nonlocal count
+        count += 1
+        if count == 4:
+            raise KeyboardInterrupt
+        finish(self, stage, result)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(RunDir, "finish", interrupted)
+        take_start(run_dir, NEWEST, [given], AFTER)
+    take_start(run_dir, NEWEST, [given], AFTER)
+    done = [step.name for step in steps_of("all", NEWEST) if is_done(run_dir, step)]
+    assert done == [step.name for step in AFTER] and run_dir.retired("imitate") == 1
+
+
+def test_a_run_that_was_started_otherwise_does_not_go_on_without_the_given_weights(
+    run_dir: RunDir, given: Path, tmp_path: Path
+) -> None:
+    others = tmp_path / "others.safetensors"
+    save_weights(build(TINY.model, 8), others, WeightsInfo(True, "elsewhere"))
+    finish_network(job(run_dir), "imitate", build(TINY.model, 5))
+    with pytest.raises(TrainError, match=r"--checkpoint: .* was started without it .it has the stage imitate"):
+        take_start(run_dir, NEWEST, [given], ())
+    second = RunDir.open(tmp_path / "second", NEWEST)
+    take_start(second, NEWEST, [given], AFTER)
+    with pytest.raises(TrainError, match="was started with other weights"):
+        take_start(second, NEWEST, [others], AFTER)
+    with pytest.raises(TrainError, match=r"--after imitate: .* was started with --after imitate-1"):
+        take_start(second, NEWEST, [given], steps_until("imitate", NEWEST, steps_of("all", NEWEST)))
+    third = RunDir.open(tmp_path / "third", NEWEST)
+    take_start(third, NEWEST, [given], ())
+    finish_network(replace(job(third)), "imitate", build(TINY.model, 5))
+    with pytest.raises(TrainError, match=r"--after imitate-1: .* was started without --after"):
+        take_start(third, NEWEST, [given], AFTER)
 
 
 @pytest.mark.parametrize(
