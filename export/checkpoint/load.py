@@ -119,7 +119,7 @@ def load_checkpoint(paths: Sequence[Path], config: TicVlaConfig, *, fill_seed: i
     for source in sources:
         _check_own_config(source, config)
         if source.directory is not None:
-            tied = tied or check_config(source.directory, config).tied
+            tied = check_config(source.directory, config).tied or tied
     model = empty_network(config)
     wanted = {name: tuple(tensor.shape) for name, tensor in model.state_dict().items()}
     plan = _plan(sources, wanted, config)

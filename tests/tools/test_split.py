@@ -118,6 +118,8 @@ def test_the_table_can_be_written_while_a_run_is_unfinished(tmp_path: Path, caps
 
 def test_a_table_without_results_is_a_failure(tmp_path: Path) -> None:
     assert split.main(["--out", str(tmp_path), "--report"]) == EXIT_CHECK_FAILED
+    assert split.main(["--out", str(tmp_path / "none"), "--report"]) == EXIT_BAD_INPUT
+    assert list(tmp_path.glob("none*")) == []
 
 
 @pytest.mark.slow

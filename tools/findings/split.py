@@ -94,6 +94,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
     failed: list[str] = []
     interrupted = False
+    if args.report and not args.out.is_dir():
+        raise StoreError(f"--out {args.out}: expected the directory of a run, found none: --report drives nothing")
     if not args.report:
         if args.artifacts is None:
             raise ConditionsError("--artifacts: expected the directory of an exported model, found none")

@@ -185,6 +185,16 @@ def test_part_of_a_stacked_matrix_is_missing_by_its_own_name(tmp_path: Path) -> 
     assert "vision_tower.encoder.layer.1.attention.k_proj.bias" in refusal(tmp_path / "hf")
 
 
+def test_the_configuration_of_every_directory_is_checked(vlm: Path, tmp_path: Path) -> None:
+    """Also that of the second one, whatever the first has."""
+    second = Path(shutil.copytree(vlm, tmp_path / "second"))
+    config = json.loads((vlm / "config.json").read_text())
+    (vlm / "config.json").write_text(json.dumps({**config, "tie_word_embeddings": True}))
+    (second / "config.json").write_text("{}")
+    with pytest.raises(CheckpointError, match=r"second: config\.json|second/config\.json"):
+        load_checkpoint([vlm, second], CONFIG, fill_seed=0)
+
+
 def test_a_tensor_given_twice_is_refused(vlm: Path, model: TicVla, tmp_path: Path) -> None:
     whole = tmp_path / "whole.safetensors"
     save_weights(model, whole, WeightsInfo(True, ""))
