@@ -6,8 +6,10 @@ import asyncio
 import base64
 import itertools
 import json
+import os
 import shutil
 import subprocess
+import tempfile
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from types import TracebackType
@@ -105,9 +107,12 @@ class Chromium:
             "--hide-scrollbars",
         ]
         arguments += ["--remote-debugging-port=0", f"--user-data-dir={self._folder}", "about:blank"]
+        # It leaves its lock there; the path is short, because the lock has a socket.
+        self._temporary = tempfile.TemporaryDirectory(prefix="tic-", ignore_cleanup_errors=True)
         self._process = subprocess.Popen(
-            [EXECUTABLE, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
-        )
+            [EXECUTABLE, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+            env={**os.environ, "TMPDIR": self._temporary.name},
+        )  # fmt: skip
 
     def __enter__(self) -> Chromium:
         return self
@@ -121,6 +126,7 @@ class Chromium:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        self._temporary.cleanup()
 
     def run(self, body: Callable[[Page], Awaitable[R]]) -> R:
         """Run `body` with the browser's page."""
