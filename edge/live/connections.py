@@ -6,7 +6,6 @@ import asyncio
 import errno
 import socket
 from collections.abc import Callable
-from contextlib import suppress
 from typing import Final
 
 MOST_STRANGERS: Final = 64
@@ -81,7 +80,7 @@ async def listen(address: str, port: int) -> list[socket.socket]:
 
 
 async def accept(listening: socket.socket, make: Callable[[], asyncio.BaseProtocol], strangers: Strangers) -> None:
-    """Accept connections for ever, each a stranger first. A client that is gone already costs nothing."""
+    """Accept connections for ever, each a stranger first."""
     loop = asyncio.get_running_loop()
 
     def stranger() -> asyncio.BaseProtocol:
@@ -96,5 +95,7 @@ async def accept(listening: socket.socket, make: Callable[[], asyncio.BaseProtoc
             await asyncio.sleep(_PAUSE_S)
             continue
         connection.setblocking(False)
-        with suppress(OSError):
+        try:
             await loop.connect_accepted_socket(stranger, connection)
+        except OSError:  # the client is gone already
+            connection.close()

@@ -327,8 +327,10 @@ async def serve(runner: socket.socket) -> None:
     runner.send(wire.Datagram(wire.LISTENING, str(port).encode()).encode())
     while data := await _received(runner):
         server.take(data)
-    for task, each in zip(accepting, listening, strict=True):  # at once: the next run may listen at this port
+    for task in accepting:
         task.cancel()
+    await asyncio.wait(accepting)
+    for each in listening:  # now: the next run may listen at this port
         each.close()
     await server.finish()
     await serving.cleanup()

@@ -190,12 +190,14 @@ def test_a_cached_export_is_byte_identical_even_if_the_first_was_changed(nano_di
 
 def export_interrupted_by(number: signal.Signals, command: Sequence[str], stage: str) -> None:
     """Start an export and send it a signal when it has begun a stage; it must end as an interrupted command does."""
-    # A background job of a shell ignores SIGINT and so would its children; what is handled here is default there.
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    # A background job of a shell ignores SIGINT, one of nohup SIGHUP, and so would its children; what is handled here
+    # is default there.
+    before = {each: signal.signal(each, signal.default_int_handler) for each in (signal.SIGINT, signal.SIGHUP)}
     try:
         process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=Path(__file__).parents[3])
     finally:
-        signal.signal(signal.SIGINT, before)
+        for each, handler in before.items():
+            signal.signal(each, handler)
     try:
         assert process.stderr is not None
         for line in process.stderr:
