@@ -14,7 +14,7 @@ from edge.deploy.doctor.check import Check, Level, skipped
 from edge.deploy.doctor.rights import UserRights
 from edge.deploy.link_rights import SERIAL_GROUP, serial_device
 from edge.deploy.unit_check import run_command
-from edge.deploy.units import FIREWALL_FILE, FIREWALL_FOLDER
+from edge.deploy.units import FIREWALL_FILE, FIREWALL_FOLDER, FIREWALL_UNIT
 from firmware_bridge.backends import INSTALL
 from firmware_bridge.core.config import ConfigError, RobotConfig
 
@@ -27,10 +27,10 @@ _IFF_UP: Final = 1
 
 
 def robot_links(robot: RobotConfig, root: Path, user: UserRights, run: Runner = run_command) -> Iterator[Check]:
-    """Yield the checks of the robot's link; `root`: root folder of Linux's files, `run`: runs `ip`."""
+    """Yield the checks of the robot's link; `root`: root folder of Linux's files, `run`: runs `ip` and `systemctl`."""
     device = serial_device(robot)
     if robot.dds is not None:
-        yield cable(robot.dds.interface, root)
+        yield cable(robot.dds.interface, root, run)
     elif device is not None:
         yield serial_line(device, root, user)
     elif robot.can is not None and robot.can.interface == "socketcan":
@@ -44,7 +44,7 @@ def robot_links(robot: RobotConfig, root: Path, user: UserRights, run: Runner = 
         yield signing_key(robot.mavlink.signing_key, host, root)
 
 
-def cable(interface: str, root: Path) -> Check:
+def cable(interface: str, root: Path, run: Runner = run_command) -> Check:
     """Whether only this machine reaches the robot: its interface is no radio, not bridged, not routed, filtered."""
     name = "robot's cable"
     if interface == "lo":
@@ -67,7 +67,20 @@ def cable(interface: str, root: Path) -> Check:
     if not (root / rules.relative_to("/")).exists():
         advice = "edge-install units writes it; its printed commands load it"
         return Check(name, Level.WARN, f"{interface}, without {rules}", _OWN_CABLE, advice)
-    return Check(name, Level.OK, f"{interface}; {rules} is there", _OWN_CABLE)
+    if (state := _unit_state(FIREWALL_UNIT, run)) != "active":
+        advice = f"sudo systemctl restart {FIREWALL_UNIT}; journalctl -u {FIREWALL_UNIT} shows what it says"
+        return Check(name, Level.WARN, f"{interface}; {rules} is there, its service is {state}", _OWN_CABLE, advice)
+    return Check(name, Level.OK, f"{interface}; {rules} is loaded", _OWN_CABLE)
+
+
+def _unit_state(unit: str, run: Runner) -> str:
+    """Return what systemd says of a unit, for any user: active, inactive, failed, …; unknown without systemd."""
+    try:
+        _, text = run(("systemctl", "is-active", unit))
+    except (OSError, subprocess.TimeoutExpired):
+        return "unknown"
+    state = text.strip()
+    return state if state.isalpha() else "unknown"  # a sentence: there is no systemd to ask
 
 
 def _default_routes(root: Path) -> list[str]:

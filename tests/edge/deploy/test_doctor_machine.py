@@ -256,7 +256,32 @@ ROUTE = (
 
 def test_a_cable_of_its_own_behind_the_firewall_is_good(tmp_path: Path) -> None:
     write(tmp_path, ADDRESS | RULES | {"proc/net/route": ROUTE.replace("NAME", "wlan0")})
-    assert cable("eth0", tmp_path).level is Level.OK
+    asked: list[Sequence[str]] = []
+    check = cable("eth0", tmp_path, lambda words: (asked.append(words) or 0, "active\n"))
+    assert check.level is Level.OK and asked == [("systemctl", "is-active", "tic-vla-edge-firewall.service")]
+
+
+@pytest.mark.parametrize(
+    ("answer", "state"),
+    [
+        ("inactive\n", "inactive"),
+        ("failed\n", "failed"),
+        ("System has not been booted with systemd as init system.\nFailed to connect to bus", "unknown"),
+        (FileNotFoundError("systemctl"), "unknown"),
+    ],
+)
+def test_rules_that_are_written_and_not_loaded_are_a_warning(
+    tmp_path: Path, answer: str | Exception, state: str
+) -> None:
+    def run(_words: Sequence[str]) -> tuple[int, str]:
+        if isinstance(answer, Exception):
+            raise answer
+        return 3, answer
+
+    write(tmp_path, ADDRESS | RULES)
+    check = cable("eth0", tmp_path, run)
+    assert check.level is Level.WARN and check.found.endswith(f"is there, its service is {state}")
+    assert "sudo systemctl restart tic-vla-edge-firewall.service" in check.advice
 
 
 @pytest.mark.parametrize(
