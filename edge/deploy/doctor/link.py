@@ -12,6 +12,7 @@ from typing import Any, Final
 
 from edge.deploy.doctor.check import Check, Level, skipped
 from edge.deploy.doctor.rights import UserRights
+from edge.deploy.firewall import TABLE
 from edge.deploy.link_rights import SERIAL_GROUP, serial_device
 from edge.deploy.unit_check import run_command
 from edge.deploy.units import FIREWALL_FILE, FIREWALL_FOLDER, FIREWALL_UNIT
@@ -67,10 +68,34 @@ def cable(interface: str, root: Path, run: Runner = run_command) -> Check:
     if not (root / rules.relative_to("/")).exists():
         advice = "edge-install units writes it; its printed commands load it"
         return Check(name, Level.WARN, f"{interface}, without {rules}", _OWN_CABLE, advice)
-    if (state := _unit_state(FIREWALL_UNIT, run)) != "active":
+    try:
+        text = (root / rules.relative_to("/")).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        text = ""
+    if f'"{interface}"' not in text:
+        advice = f"repeat edge-install units with this robot file, then sudo systemctl restart {FIREWALL_UNIT}"
+        return Check(name, Level.WARN, f"{interface}; {rules} does not name it", _OWN_CABLE, advice)
+    loaded, state = _in_kernel(interface, run), _unit_state(FIREWALL_UNIT, run)
+    if loaded is False or (loaded is None and state != "active"):
+        found = f"{interface}; {rules} is there, its service is {state}"
+        found += "" if loaded is None else f", and the kernel has no such rules for {interface}"
         advice = f"sudo systemctl restart {FIREWALL_UNIT}; journalctl -u {FIREWALL_UNIT} shows what it says"
-        return Check(name, Level.WARN, f"{interface}; {rules} is there, its service is {state}", _OWN_CABLE, advice)
+        return Check(name, Level.WARN, found, _OWN_CABLE, advice)
     return Check(name, Level.OK, f"{interface}; {rules} is loaded", _OWN_CABLE)
+
+
+def _in_kernel(interface: str, run: Runner) -> bool | None:
+    """Return whether the kernel has the firewall's table for this interface; None where it cannot be asked (not root).
+
+    The service stays active when another program has flushed its rules.
+    """
+    try:
+        code, text = run(("nft", "list", "table", "inet", TABLE))
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    if code != 0:
+        return False if "No such file or directory" in text else None
+    return f'"{interface}"' in text
 
 
 def _unit_state(unit: str, run: Runner) -> str:
@@ -110,10 +135,18 @@ def can_interface(channel: str, bitrate_bps: int, root: Path, run: Runner = run_
     if details is None:
         advice = f"install iproute2, or look at: ip -details link show {channel}"
         return Check(name, Level.WARN, f"{channel} is up; its bitrate is unknown", expected, advice)
-    if details.get("info_kind") != "can":
-        return Check(name, Level.OK, f"{channel} is up, of kind {details.get('info_kind')}: a simulated bus")
-    data = details.get("info_data") or {}
-    bitrate, state = (data.get("bittiming") or {}).get("bitrate"), data.get("state", "unknown")
+    link, data = details.get("info_kind"), details.get("info_data") or {}
+    silent = sorted({"LISTEN-ONLY", "LOOPBACK"} & set(data.get("ctrlmode") or ()))
+    if silent:
+        advice = f"it sends nothing to the base, a stop neither: sudo ip link set {channel} down, then {bring_up} " + (
+            " ".join(f"{mode.lower()} off" for mode in silent)
+        )
+        return Check(name, Level.FAIL, f"{channel} is up, {', '.join(silent)}", expected, advice)
+    if link != "can":
+        return Check(name, Level.OK, f"{channel} is up, of kind {link}: a simulated bus")
+    # An adapter with fixed bitrates reports bittiming_bitrate instead.
+    bitrate = (data.get("bittiming") or {}).get("bitrate", data.get("bittiming_bitrate"))
+    state = data.get("state", "unknown")
     found = f"{channel} is up, {bitrate} bit/s, {state}, restart-ms {data.get('restart_ms', 0)}"
     again = bring_up.replace(" up ", f" down; sudo ip link set {channel} up ", 1)
     if bitrate != bitrate_bps:

@@ -25,6 +25,8 @@ from firmware_bridge.core.config import OPERATOR_SUFFIX, ConfigError
 FROM_UNIT = "the service gets it from its unit (edge-install units)"
 SHARED_FOLDER_MODE = 0o711
 """Mode of the installed service's folder: the modes of its sockets decide."""
+_SYSTEM_FOLDERS = frozenset(map(Path, ("/", "/run", "/tmp", "/var/run", "/var/tmp", "/dev/shm")))
+"""Folders of all programs, whose mode must stay."""
 _SETTLE_S = 0.2
 """Time between opening a meter and reading it: an energy counter needs some."""
 
@@ -147,7 +149,10 @@ def socket_folder(socket: Path, user: UserRights) -> Check:
     if mode == SHARED_FOLDER_MODE:
         return _service_sockets(socket, user, found.st_uid)
     if mode & 0o077:
-        expected, advice = "mode 0700, or 0711 of the service", f"chmod 0700 {folder}: any user could command the robot"
+        expected = "mode 0700, or 0711 of the service"
+        advice = f"chmod 0700 {folder}: any user could command the robot"
+        if mode & stat.S_ISVTX or found.st_uid != user.uid or folder in _SYSTEM_FOLDERS:
+            advice = f"name a socket in a folder of its own with --socket: in {folder} any user could command the robot"
         return Check(name, Level.FAIL, text, expected, advice)
     if found.st_uid != user.uid and user.uid != 0:
         expected = f"user {user.uid} ({user.name})"

@@ -50,6 +50,10 @@ def ip_says(info: dict[str, Any], kind: str = "can") -> Callable[[Sequence[str]]
         ({"state": "BUS-OFF"}, Level.FAIL, "termination"),
         ({"bittiming": {"bitrate": 250000}}, Level.FAIL, "correct the robot file, or sudo ip link set can0 down"),
         ({"bittiming": {}}, Level.FAIL, "None bit/s"),
+        ({"bittiming": {}, "bittiming_bitrate": BITRATE_BPS}, Level.OK, "500000 bit/s"),  # an adapter with fixed ones
+        ({"ctrlmode": ["LISTEN-ONLY"]}, Level.FAIL, "a stop neither: sudo ip link set can0 down"),
+        ({"ctrlmode": ["LOOPBACK"]}, Level.FAIL, "restart-ms 100 loopback off"),
+        ({"ctrlmode": ["BERR-REPORTING"]}, Level.OK, "500000 bit/s"),
     ],
 )
 def test_a_can_interface_is_judged_by_its_state_and_its_restart(

@@ -6,7 +6,7 @@ import argparse
 import datetime
 import io
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -247,7 +247,7 @@ def test_a_finding_is_printed_without_markup() -> None:
     assert "rm [a]" in text.getvalue()
 
 
-RULES = {"etc/tic-vla-edge/tic-vla-edge.nft": ""}
+RULES = {"etc/tic-vla-edge/tic-vla-edge.nft": 'oifname != "eth0" accept'}
 ADDRESS = {"sys/class/net/eth0/address": "02:00:00:00:00:01\n"}
 ROUTE = (
     "Iface\tDestination\tGateway\tFlags\tRefCnt\tUse\tMetric\tMask\nNAME\t00000000\t017BA8C0\t3\t0\t0\t0\t00000000\n"
@@ -256,9 +256,44 @@ ROUTE = (
 
 def test_a_cable_of_its_own_behind_the_firewall_is_good(tmp_path: Path) -> None:
     write(tmp_path, ADDRESS | RULES | {"proc/net/route": ROUTE.replace("NAME", "wlan0")})
-    asked: list[Sequence[str]] = []
-    check = cable("eth0", tmp_path, lambda words: (asked.append(words) or 0, "active\n"))
-    assert check.level is Level.OK and asked == [("systemctl", "is-active", "tic-vla-edge-firewall.service")]
+    check = cable("eth0", tmp_path, kernel_and_systemd((1, NOT_ROOT), "active\n"))
+    assert check.level is Level.OK
+    assert cable("eth0", tmp_path, kernel_and_systemd((0, 'oifname != "eth0" accept'), "active\n")).level is Level.OK
+
+
+NOT_ROOT = "Operation not permitted (you must be root)\nnetlink: Error: cache initialization failed"
+
+
+def kernel_and_systemd(rules: tuple[int, str], state: str) -> Callable[[Sequence[str]], tuple[int, str]]:
+    """What `nft list table` and `systemctl is-active` answer."""
+
+    def run(words: Sequence[str]) -> tuple[int, str]:
+        if words[0] == "nft":
+            assert words == ("nft", "list", "table", "inet", "tic_vla_edge")
+            return rules
+        assert words == ("systemctl", "is-active", "tic-vla-edge-firewall.service")
+        return 0, state
+
+    return run
+
+
+@pytest.mark.parametrize(
+    "rules",
+    [(1, "Error: No such file or directory"), (0, 'oifname != "eth1" accept')],
+    ids=["flushed", "another cable"],
+)
+def test_rules_that_the_kernel_has_lost_are_a_warning_although_the_service_is_active(
+    tmp_path: Path, rules: tuple[int, str]
+) -> None:
+    write(tmp_path, ADDRESS | RULES)
+    check = cable("eth0", tmp_path, kernel_and_systemd(rules, "active\n"))
+    assert check.level is Level.WARN and "the kernel has no such rules for eth0" in check.found
+
+
+def test_rules_for_another_cable_are_a_warning(tmp_path: Path) -> None:
+    write(tmp_path, ADDRESS | {"etc/tic-vla-edge/tic-vla-edge.nft": 'oifname != "eth1" accept'})
+    check = cable("eth0", tmp_path, kernel_and_systemd((1, NOT_ROOT), "active\n"))
+    assert check.level is Level.WARN and "does not name it" in check.found and "repeat edge-install" in check.advice
 
 
 @pytest.mark.parametrize(

@@ -171,6 +171,18 @@ class TestServiceSockets:
         assert socket_folder(path, self.runner(path, self.RUNNERS)).level is Level.SKIP
 
 
+def test_nobody_is_told_to_close_a_folder_of_all_programs(tmp_path: Path) -> None:
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    own = replace(ME, uid=tmp_path.stat().st_uid)
+    for folder, mode, advice in ((shared, 0o1777, "name a socket in a folder"), (shared, 0o755, "chmod 0700")):
+        folder.chmod(mode)
+        check = socket_folder(folder / "bridge.sock", own)
+        assert check.level is Level.FAIL and advice in check.advice
+    assert "chmod" not in socket_folder(Path("/tmp/bridge.sock"), own).advice
+    assert "chmod" not in socket_folder(shared / "bridge.sock", replace(own, uid=own.uid + 1)).advice
+
+
 def test_a_socket_folder_that_is_not_there_yet_is_made_by_the_bridge(tmp_path: Path) -> None:
     assert socket_folder(tmp_path / "none" / "bridge.sock", ME).level is Level.SKIP
 
